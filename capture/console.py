@@ -1,0 +1,68 @@
+"""Runs a Typer application so that a user sees one line and an exit code, never a traceback."""
+
+import json
+import os
+import sys
+from typing import Any, NoReturn
+
+import click
+import typer
+
+from capture.errors import WingshapeError
+
+
+def run(app: typer.Typer) -> NoReturn:
+    """Run ``app`` on the process's arguments and exit.
+
+    Exit codes: 0 done; 1 a failure (``WingshapeError``, or the system refused a file); 2 wrong usage;
+    130 interrupted. Set ``WINGSHAPE_DEBUG=1`` to see the traceback behind an error line.
+    """
+    try:
+        code = app(standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        sys.exit(stop.exit_code)
+    except click.ClickException as error:
+        _fail(error.format_message(), 2)
+    except (click.Abort, KeyboardInterrupt):
+        _fail("interrupted", 130)
+    except WingshapeError as error:
+        _fail(str(error), error.exit_code)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _fail(f"{place}{error.strerror or error}", 1)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    if os.environ.get("WINGSHAPE_DEBUG") and sys.exc_info()[1] is not None:
+        raise  # called from an except block only
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
+    sys.exit(code)
+
+
+def say(text: str = "") -> None:
+    """Print a result line to standard output."""
+    print(text, flush=True)  # noqa: T201
+
+
+def note(text: str) -> None:
+    """Print progress or a warning to standard error, so that standard output stays parseable."""
+    print(text, file=sys.stderr, flush=True)  # noqa: T201
+
+
+def say_json(value: Any) -> None:
+    """Print ``value`` as JSON on standard output (NaN becomes null)."""
+    say(json.dumps(_without_nan(value), indent=2))
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, float) and value != value:
+        return None
+    if isinstance(value, dict):
+        return {str(key): _without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    return value

@@ -1,0 +1,80 @@
+r"""The trigger board's serial line protocol, version 1: lines to values and back. No I/O.
+
+Each line is ``$<body>*<crc>\r\n``: ASCII, at most 120 bytes, crc = CRC-16/XMODEM of the body as four hex digits.
+The body is words separated by one space.
+
+Host to board              board answers
+``HELLO``                  ``OK HELLO <protocol version> <board name>``
+``RATE <millihertz>``      ``OK RATE <millihertz>``
+``START <index>``          ``OK START <index>``: pulses follow, the first one has this index
+``STOP``                   ``OK STOP <next index> <counter>``: no pulse after this line
+``STATUS``                 ``OK STATUS <running 0|1> <next index> <counter>``
+
+Anything else is answered by ``ERR <code> <words>``. A running board reports each pulse, once, after its edge:
+``PULSE <index> <counter> <commanded_ns> <actual_ns>``. ``index`` counts from START's argument; ``counter`` counts
+all edges since power-up and is never set back; both times are UTC nanoseconds of the board's PTP clock: when
+the edge was due and when the output register was written.
+"""
+
+import binascii
+from dataclasses import dataclass
+
+PROTOCOL_VERSION = 1
+MAX_LINE_BYTES = 120
+
+
+class GarbledLine(ValueError):
+    """A line whose frame or checksum is wrong. Count it; never act on it."""
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """One trigger edge as the board reports it."""
+
+    index: int
+    counter: int
+    commanded_ns: int
+    actual_ns: int
+
+    def words(self) -> tuple[str, ...]:
+        """The body's words, for the board's side."""
+        return ("PULSE", str(self.index), str(self.counter), str(self.commanded_ns), str(self.actual_ns))
+
+
+def encode_line(*words: str) -> bytes:
+    """The line whose body is ``words``."""
+    body = " ".join(words).encode("ascii")
+    return b"$%s*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
+
+
+def decode_line(line: bytes) -> tuple[str, ...]:
+    """The words of a line.
+
+    Raises:
+        GarbledLine: too long, not framed, not ASCII, or the checksum differs.
+    """
+    text = line.strip(b"\r\n")
+    if len(line) > MAX_LINE_BYTES or not text.startswith(b"$") or text[-5:-4] != b"*":
+        raise GarbledLine(f"not a protocol line: {line[:40]!r}")
+    body, crc = text[1:-5], text[-4:]
+    if b"%04X" % binascii.crc_hqx(body, 0) != crc.upper():
+        raise GarbledLine(f"checksum differs: {line[:40]!r}")
+    try:
+        return tuple(body.decode("ascii").split(" "))
+    except UnicodeDecodeError as error:
+        raise GarbledLine(f"not ASCII: {line[:40]!r}") from error
+
+
+def parse_pulse(words: tuple[str, ...]) -> Pulse:
+    """The pulse of a ``PULSE`` line's words.
+
+    Raises:
+        GarbledLine: the words do not make a pulse.
+    """
+    try:
+        name, index, counter, commanded_ns, actual_ns = words
+        if name != "PULSE":
+            raise ValueError(name)
+        return Pulse(int(index), int(counter), int(commanded_ns), int(actual_ns))
+    except ValueError as error:
+        raise GarbledLine(f"not a pulse: {' '.join(words)[:40]!r}") from error

@@ -1,0 +1,1 @@
+"""On the ground: from recorded frames to 3-D markers with covariances."""
