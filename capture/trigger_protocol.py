@@ -6,7 +6,8 @@ The body is words separated by one space.
 Host to board              board answers
 ``HELLO``                  ``OK HELLO <protocol version> <board name>``
 ``RATE <millihertz>``      ``OK RATE <millihertz>``
-``START <index>``          ``OK START <index>``: pulses follow, the first one has this index
+``START <index> <count>``  ``OK START <index> <count>``: pulses follow, the first one has this index; the board
+                           stops by itself after ``count`` pulses (0: runs until STOP)
 ``STOP``                   ``OK STOP <next index> <counter>``: no pulse after this line
 ``STATUS``                 ``OK STATUS <running 0|1> <next index> <counter>``
 

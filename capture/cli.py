@@ -1,0 +1,115 @@
+"""`wingcap`: the commands of the recording side."""
+
+import signal
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from capture.clock import SystemClock
+from capture.config import load_config
+from capture.console import note, run, say, say_json
+from capture.daemon import Recording, RecordingResult, StopRule
+from capture.errors import CaptureError
+from capture.verify import FlightReport, inspect
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    help="Record a flight, and say what is in a recording and whether it is whole.",
+)
+FlightFolders = Annotated[list[Path], typer.Argument(help="the flight's folder on each disk, or a folder above them")]
+Json = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
+
+
+@app.command()
+def record(
+    config: Annotated[Path, typer.Option("--config", help="the recorder's TOML file")],
+    triggers: Annotated[int, typer.Option(min=0, help="end after this many triggers (0: no limit)")] = 0,
+    duration: Annotated[float, typer.Option(min=0, help="end after this many seconds (0: no limit)")] = 0.0,
+    json: Json = False,
+) -> None:
+    """Record until SIGTERM, Ctrl-C, or the given number of triggers or seconds."""
+    requested = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: requested.set())
+    recording = Recording(load_config(config), SystemClock(), note)
+    note(f"recording {recording.flight}")
+    result = recording.run(StopRule(requested, triggers, duration))
+    if json:
+        say_json(result.as_dict())
+    else:
+        _print_result(result)
+    if result.failures:
+        raise CaptureError("; ".join(result.failures))
+
+
+@app.command()
+def info(flight: FlightFolders, json: Json = False) -> None:
+    """Say what is in a recording, whole or not."""
+    report = inspect(flight)
+    if json:
+        say_json(report.as_dict())
+    else:
+        _print_report(report)
+
+
+@app.command()
+def verify(flight: FlightFolders, json: Json = False) -> None:
+    """Read every byte and check that every trigger of every camera is recorded, or lost with a cause.
+
+    Exit code 0: whole. 1: not whole, with each problem named.
+    """
+    report = inspect(flight)
+    if json:
+        say_json(report.as_dict())
+    else:
+        _print_report(report)
+        if report.whole:
+            say(
+                f"WHOLE: {report.triggers} triggers × {len(report.cameras)} cameras = "
+                f"{report.recorded} recorded + {report.lost} lost; every byte of every chunk agrees with its CRC"
+            )
+    if not report.whole:
+        raise CaptureError(
+            f"the recording is not whole: {len(report.problems)} problems, the first: {report.problems[0]}"
+        )
+
+
+def main() -> None:
+    """Entry point."""
+    run(app)
+
+
+def _print_result(result: RecordingResult) -> None:
+    say(
+        f"{result.flight}: {result.triggers} triggers in {result.seconds:.1f} s, "
+        f"{result.recorded} frames recorded, {result.lost} lost"
+    )
+    table = Table("camera", "recorded", "lost", "ring high water", title=None)
+    for place, account in result.accounts.items():
+        lost = ", ".join(f"{n} at {stage}" for stage, n in account.lost.items()) or "0"
+        water = f"{result.ring_high_water[place]} of {result.ring_slots}"
+        table.add_row("/".join(place), str(account.recorded), lost, water)
+    Console().print(table)
+    for folder in result.folders:
+        say(f"  {folder}")
+
+
+def _print_report(report: FlightReport) -> None:
+    size_gb = report.size_bytes / 1e9
+    seconds = (report.last_trigger_ns - report.first_trigger_ns) / 1e9
+    flight = report.provenance.get("flight", "unnamed")
+    say(f"{flight}: {report.triggers} triggers over {seconds:.2f} s, {size_gb:.2f} GB in {len(report.files)} files")
+    modes = ", ".join(sorted({file.provenance.get("write_mode", "unknown") for file in report.files}))
+    say(f"recorded by wingshape {report.provenance.get('version', 'unknown')}, write mode {modes}")
+    table = Table("camera", "size", "recorded", "lost")
+    for name, camera in sorted(report.cameras.items()):
+        lost = ", ".join(f"{n} at {stage}" for stage, n in camera.lost.items()) or "0"
+        table.add_row(name, f"{camera.width}×{camera.height}", str(camera.recorded), lost)
+    Console().print(table)
+    for problem in report.problems:
+        say(f"PROBLEM: {problem}")

@@ -1,0 +1,153 @@
+"""The recorder's configuration: a TOML file to checked values."""
+
+import hashlib
+import math
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from capture.camera import BACKENDS
+from capture.camera.base import CameraSettings
+from capture.errors import ConfigError
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TriggerConfig(_Table):
+    """The trigger board: where it is and how fast it shall run."""
+
+    port: str
+    rate_hz: Annotated[float, Field(gt=0, le=200)] = 25.0
+    first_index: Annotated[int, Field(ge=0)] = 0
+
+
+class DiskConfig(_Table):
+    """The two disks, one for each side's pair of cameras."""
+
+    left: Path
+    right: Path
+    segment_s: Annotated[float, Field(gt=0)] = 60.0
+    segment_mb: Annotated[float, Field(gt=0)] = 8000.0
+    reserve_mb: Annotated[float, Field(ge=0)] = 500.0
+    write: Literal["auto", "direct", "buffered"] = "auto"
+
+
+class RingConfig(_Table):
+    """How long a disk may stall before a frame is lost for want of room."""
+
+    stall_s: Annotated[float, Field(gt=0, le=60)] = 2.0
+    lock_memory: bool = True
+
+
+class CameraDefaults(_Table):
+    """What all cameras have in common."""
+
+    backend: str
+    width: Annotated[int, Field(gt=0, le=16384)] = 2080
+    height: Annotated[int, Field(gt=0, le=16384)] = 1552
+    exposure_us: Annotated[int, Field(gt=0, le=1_000_000)] = 2000
+    gain_db: float = 0.0
+
+    @model_validator(mode="after")
+    def _known_backend(self) -> "CameraDefaults":
+        if self.backend not in BACKENDS:
+            raise ValueError(f"backend {self.backend!r} is unknown: use one of {', '.join(sorted(BACKENDS))}")
+        return self
+
+
+class CameraPlace(_Table):
+    """One camera: where it stands and how to reach it. ``serial`` binds a device to its place."""
+
+    side: Literal["left", "right"]
+    name: Literal["cam0", "cam1"]
+    address: str
+    serial: str | None = None
+
+
+class Config(_Table):
+    """Everything that ``wingcap record`` needs to know."""
+
+    trigger: TriggerConfig
+    disks: DiskConfig
+    camera: CameraDefaults
+    cameras: Annotated[list[CameraPlace], Field(min_length=1, max_length=4)]
+    ring: RingConfig = RingConfig()
+    flight: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    calibration: Path | None = None
+
+    @model_validator(mode="after")
+    def _places_differ(self) -> "Config":
+        places = [(camera.side, camera.name) for camera in self.cameras]
+        for place in places:
+            if places.count(place) > 1:
+                raise ValueError(f"cameras: {place[0]} {place[1]} is named twice")
+        return self
+
+    @property
+    def settings(self) -> CameraSettings:
+        """What every camera is asked to be."""
+        camera = self.camera
+        return CameraSettings(camera.width, camera.height, camera.exposure_us, camera.gain_db)
+
+    @property
+    def ring_slots(self) -> int:
+        """Slots of each camera's ring: the stall it must bridge, and what the driver always holds."""
+        return math.ceil(self.ring.stall_s * self.trigger.rate_hz) + DRIVER_BUFFERS
+
+
+DRIVER_BUFFERS = 6
+"""Buffers a driver holds at all times, so that a full ring is met by us, with a cause, and not by the driver."""
+
+
+@dataclass(frozen=True)
+class LoadedConfig:
+    """A configuration with the text it came from, which every segment carries."""
+
+    config: Config
+    text: str
+    sha256: str
+
+
+def load_config(path: Path) -> LoadedConfig:
+    """Read and check a configuration file. Relative paths in it are relative to its folder.
+
+    Raises:
+        ConfigError: missing, not TOML, an unknown key or a value out of range; the message names the file and the key.
+    """
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}): give an existing file with --config") from error
+    try:
+        text = raw.decode()
+        config = Config.model_validate(tomllib.loads(text))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file ({error}): mend that line") from error
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_first_problem(error)}") from error
+    folder = path.parent
+    disks = config.disks.model_copy(update={"left": folder / config.disks.left, "right": folder / config.disks.right})
+    calibration = folder / config.calibration if config.calibration else None
+    if calibration is not None and not calibration.is_file():
+        raise ConfigError(
+            f"{calibration}: the calibration named in {path} is missing: make it with `wingproc rig`, "
+            "or remove the key `calibration`"
+        )
+    config = config.model_copy(update={"disks": disks, "calibration": calibration})
+    return LoadedConfig(config, text, hashlib.sha256(raw).hexdigest())
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    key = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        return f"unknown key `{key}`: remove it or correct its spelling (docs/reference/config.md lists the keys)"
+    if problem["type"] == "missing":
+        return f"key `{key}` is missing: add it (docs/reference/config.md lists the keys)"
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"`{key}`: {message}" if key else message

@@ -1,0 +1,436 @@
+"""The recording daemon: cameras, trigger board and disks wired together, from start to a closed flight."""
+
+import contextlib
+import datetime
+import json
+import platform
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from capture.camera import make_camera
+from capture.camera.base import Camera, CameraDescription
+from capture.clock import Clock
+from capture.config import Config, LoadedConfig
+from capture.errors import CameraError, DiskError, TriggerBoardError
+from capture.flight import make_folder, write_metadata
+from capture.grabber import Grabber, SideGate
+from capture.ledger import CameraAccount, Ledger, Place
+from capture.record import SIDES, Diagnostic, Loss, Trigger, encode_diagnostics
+from capture.recorder import Recorder, camera_channels
+from capture.ring import Ring
+from capture.segment import FrameLayout, SmallMessage
+from capture.trigger import BoardCount, TriggerBoard, TriggerLog
+from capture.trigger_protocol import Pulse
+
+CONTROL_PERIOD_S = 0.1
+DIAGNOSTICS_PERIOD_S = 1.0
+DRAIN_DEADLINE_S = 2.0  # how long frames of the last triggers may take to arrive
+FLUSH_DEADLINE_S = 60.0  # how long the disks may take to write what is in the rings
+GIL_SWITCH_S = 0.0005  # the interpreter's 5 ms would let one busy thread hold up a write
+
+
+@dataclass(frozen=True)
+class StopRule:
+    """When a recording ends by itself; it always ends when ``requested`` is set."""
+
+    requested: threading.Event
+    triggers: int = 0  # 0: no limit
+    duration_s: float = 0.0  # 0: no limit
+
+
+@dataclass
+class RecordingResult:
+    """What ``record`` did."""
+
+    flight: str
+    folders: list[Path]
+    triggers: int
+    accounts: dict[Place, CameraAccount]
+    write_modes: dict[str, str]
+    ring_high_water: dict[Place, int]
+    ring_slots: int
+    ring_locked: bool
+    seconds: float
+    failures: list[str] = field(default_factory=list)
+
+    @property
+    def recorded(self) -> int:
+        """Frames in the files."""
+        return sum(account.recorded for account in self.accounts.values())
+
+    @property
+    def lost(self) -> int:
+        """Frames that are booked as lost."""
+        return sum(account.lost_total for account in self.accounts.values())
+
+    def as_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "flight": self.flight,
+            "folders": [str(folder) for folder in self.folders],
+            "triggers": self.triggers,
+            "frames_recorded": self.recorded,
+            "frames_lost": self.lost,
+            "cameras": {
+                "/".join(place): {"recorded": account.recorded, "lost": account.lost}
+                for place, account in self.accounts.items()
+            },
+            "write_modes": self.write_modes,
+            "ring_slots": self.ring_slots,
+            "ring_locked": self.ring_locked,
+            "ring_high_water": {"/".join(place): n for place, n in self.ring_high_water.items()},
+            "seconds": self.seconds,
+            "failures": self.failures,
+        }
+
+
+class AuxLog:
+    """Collects small messages from any thread for the aux files of all disks."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._messages: list[SmallMessage] = []
+        self._diagnostics = 0
+        self._mutex = threading.Lock()
+
+    def trigger(self, trigger: Trigger) -> None:
+        """A pulse of the board."""
+        self._add(SmallMessage(1, trigger.index, trigger.receive_time_ns, trigger.reported_time_ns, trigger.encode()))
+
+    def loss(self, loss: Loss) -> None:
+        """A lost frame."""
+        self._add(SmallMessage(2, loss.trigger_index, loss.time_ns, loss.time_ns, loss.encode()))
+
+    def diagnostics(self, statuses: tuple[Diagnostic, ...]) -> None:
+        """The state of things."""
+        now_ns = self._clock.utc_ns()
+        self._diagnostics += 1
+        self._add(SmallMessage(3, self._diagnostics, now_ns, now_ns, encode_diagnostics(now_ns, statuses)))
+
+    def take(self) -> tuple[SmallMessage, ...]:
+        """What has come since the last call."""
+        with self._mutex:
+            messages, self._messages = tuple(self._messages), []
+        return messages
+
+    def _add(self, message: SmallMessage) -> None:
+        with self._mutex:
+            self._messages.append(message)
+
+
+class Recording:
+    """One flight being recorded. Owns every thread and device; ``run`` leaves all of them closed."""
+
+    def __init__(self, loaded: LoadedConfig, clock: Clock, progress: Callable[[str], None]) -> None:
+        self._loaded = loaded
+        self._config: Config = loaded.config
+        self._clock = clock
+        self._progress = progress
+        started = datetime.datetime.fromtimestamp(clock.utc_ns() / 1e9, datetime.UTC)
+        self.flight = self._config.flight or f"flight_{started:%Y%m%dT%H%M%SZ}"
+        self._aux = AuxLog(clock)
+        self._triggers = TriggerLog(self._config.trigger.rate_hz)
+        self._cameras: dict[Place, tuple[Camera, CameraDescription]] = {}
+        self._grabbers: dict[Place, Grabber] = {}
+        self._recorders: dict[str, Recorder] = {}
+        self._failures: list[str] = []
+        self._flight_id = f"{self.flight}-{clock.utc_ns():x}"
+        places = [(camera.side, camera.name) for camera in self._config.cameras]
+        self._ledger = Ledger(places, self._config.trigger.first_index, clock.utc_ns, self._aux.loss)
+
+    def run(self, stop: StopRule) -> RecordingResult:
+        """Record until told to stop, then account for everything and close.
+
+        Raises:
+            CaptureError: something needed at the start is not there: a camera, the board, a disk. What goes wrong
+                later ends only the side it concerns and stands in the result's ``failures``.
+        """
+        sys.setswitchinterval(GIL_SWITCH_S)
+        with contextlib.ExitStack() as cleanup:
+            self._open_cameras(cleanup)
+            board = TriggerBoard(self._config.trigger.port, self._clock, self._on_pulse)
+            cleanup.callback(board.close)
+            board.start()
+            name = board.hello()
+            board.set_rate(self._config.trigger.rate_hz)
+            was_running, _ = board.status()
+            before = board.end() if was_running else board.status()[1]
+            self._open_disks(name)
+            self._make_grabbers()
+            for recorder in self._recorders.values():
+                recorder.start()
+            for grabber in self._grabbers.values():
+                grabber.arm()
+                grabber.start()
+            started_s = self._clock.monotonic_s()
+            board.begin(self._config.trigger.first_index, stop.triggers)
+            self._control(board, stop, started_s)
+            count = self._end_triggers(board)
+            seconds = self._clock.monotonic_s() - started_s
+            return self._finish(before, count, seconds)
+
+    def _on_pulse(self, pulse: Pulse, trigger: Trigger) -> None:
+        self._triggers.add(pulse)
+        self._ledger.triggered(pulse.index + 1)
+        self._aux.trigger(trigger)
+
+    def _open_cameras(self, cleanup: contextlib.ExitStack) -> None:
+        for place in self._config.cameras:
+            name = f"{place.side}/{place.name}"
+            camera = make_camera(self._config.camera.backend, place.address, self._config.settings)
+            cleanup.callback(camera.close)
+            try:
+                description = camera.open()
+            except CameraError as error:
+                raise CameraError(f"{name}: {error}") from error
+            if place.serial is not None and place.serial != description.serial:
+                raise CameraError(
+                    f"{name}: serial {description.serial} answers at {place.address}, not {place.serial}: "
+                    "swap the cables, or the serials in the configuration"
+                )
+            if not description.hardware_trigger:
+                raise CameraError(f"{name}: {description.model} has no hardware trigger: it cannot be synchronised")
+            self._cameras[place.side, place.name] = (camera, description)
+
+    def _open_disks(self, board_name: str) -> None:
+        provenance = self._provenance(board_name)
+        height, width = self._config.camera.height, self._config.camera.width
+        for side in SIDES:
+            names = [name for camera_side, name in self._cameras if camera_side == side]
+            if not names:
+                continue
+            disk: Path = getattr(self._config.disks, side)
+            try:
+                folder = make_folder(disk, self.flight)
+            except OSError as error:
+                raise DiskError(
+                    f"{disk}: cannot be written ({error.strerror}): mount the disk, or correct `disks.{side}`"
+                ) from error
+            self._recorders[side] = Recorder(
+                side,
+                folder,
+                names,
+                (height, width),
+                self._config.disks,
+                provenance,
+                self._ledger,
+                self._clock,
+                queue_bound=len(names) * self._config.ring_slots,
+                calibration=self._config.calibration,
+            )
+
+    def _make_grabbers(self) -> None:
+        height, width = self._config.camera.height, self._config.camera.width
+        for side, recorder in self._recorders.items():
+            names = [name for camera_side, name in self._cameras if camera_side == side]
+            ids = {channel.topic: channel.id for channel in camera_channels(names, side)}
+            layouts = {
+                name: FrameLayout(
+                    ids[f"/{side}/{name}/image_raw"], ids[f"/{side}/{name}/frame"], f"{side}_{name}", width, height
+                )
+                for name in names
+            }
+            rings = {
+                name: Ring(self._config.ring_slots, layouts[name].slot_bytes, self._config.ring.lock_memory)
+                for name in names
+            }
+            gate = SideGate(list(rings.values()))
+            for name in names:
+                camera, description = self._cameras[side, name]
+                self._grabbers[side, name] = Grabber(
+                    (side, name),
+                    camera,
+                    description,
+                    rings[name],
+                    layouts[name],
+                    gate,
+                    self._triggers,
+                    self._ledger,
+                    recorder,
+                    self._clock,
+                )
+        total_mb = sum(g.ring.slots * g.ring.slot_bytes for g in self._grabbers.values()) / 1e6
+        locked = all(g.ring.locked for g in self._grabbers.values())
+        self._progress(
+            f"ring: {self._config.ring_slots} slots a camera, {total_mb:.0f} MB in all, "
+            f"{'locked in memory' if locked else 'not locked in memory (RLIMIT_MEMLOCK)'}: "
+            f"bridges a disk stall of {self._config.ring.stall_s:g} s"
+        )
+
+    def _control(self, board: TriggerBoard, stop: StopRule, started_s: float) -> None:
+        next_report_s = started_s + DIAGNOSTICS_PERIOD_S
+        while not stop.requested.wait(CONTROL_PERIOD_S):
+            now_s = self._clock.monotonic_s()
+            self._flush_aux()
+            if now_s >= next_report_s:
+                next_report_s += DIAGNOSTICS_PERIOD_S
+                self._report()
+            triggers = self._triggers_so_far()
+            if stop.triggers and triggers >= stop.triggers:
+                return
+            if stop.duration_s and now_s - started_s >= stop.duration_s:
+                return
+            if board.error is not None:
+                self._failures.append(str(board.error))
+                return
+            if all(recorder.failure is not None for recorder in self._recorders.values()):
+                return
+            if not any(grabber.running for grabber in self._grabbers.values()):
+                return
+
+    def _end_triggers(self, board: TriggerBoard) -> BoardCount | None:
+        try:
+            return board.end()
+        except TriggerBoardError as error:
+            if board.error is None:
+                self._failures.append(str(error))
+            return None
+
+    def _finish(self, before: BoardCount, count: BoardCount | None, seconds: float) -> RecordingResult:
+        first_index = self._config.trigger.first_index
+        next_index = count.next_index if count else first_index + self._triggers_so_far()
+        deadline_s = self._clock.monotonic_s() + DRAIN_DEADLINE_S
+        while self._clock.monotonic_s() < deadline_s and not all(
+            self._ledger.complete(place, next_index) or not grabber.running for place, grabber in self._grabbers.items()
+        ):
+            self._clock.sleep(0.005)
+        for place, grabber in self._grabbers.items():
+            if not grabber.stop(deadline_s=DRAIN_DEADLINE_S):
+                self._failures.append(f"{'/'.join(place)}: its read thread hangs in the camera driver")
+            if grabber.error is not None:
+                self._failures.append(str(grabber.error))
+        self._ledger.close(next_index)
+        self._report()
+        self._flush_aux()
+        for side, recorder in self._recorders.items():
+            if not recorder.stop(deadline_s=FLUSH_DEADLINE_S):
+                self._failures.append(f"{side}: the disk did not take its last frames in {FLUSH_DEADLINE_S:g} s")
+            if recorder.error is not None:
+                self._failures.append(f"{recorder.name}: {recorder.error}")
+        self._write_last_losses()
+        end = {
+            "first_index": str(first_index),
+            "next_index": str(next_index),
+            "counter_begin": str(before.counter),
+            "counter_end": str(count.counter if count else before.counter + next_index - first_index),
+            "board_confirmed": str(count is not None).lower(),
+        }
+        for recorder in self._recorders.values():
+            recorder.close(end)
+            if recorder.failure is not None:
+                self._failures.append(str(recorder.failure))
+            else:
+                write_metadata(recorder.folder, [*recorder.segments, recorder.aux])
+        return self._result(next_index - first_index, seconds)
+
+    def _write_last_losses(self) -> None:
+        """Losses that were booked while the write threads ended; no thread writes the aux files any more."""
+        messages = self._aux.take()
+        for recorder in self._recorders.values():
+            try:
+                recorder.aux.write_batch(messages)
+            except DiskError as error:
+                recorder.failure = recorder.failure or error
+
+    def _result(self, triggers: int, seconds: float) -> RecordingResult:
+        return RecordingResult(
+            flight=self.flight,
+            folders=[recorder.folder for recorder in self._recorders.values()],
+            triggers=triggers,
+            accounts=self._ledger.accounts(),
+            write_modes={side: recorder.write_mode for side, recorder in self._recorders.items()},
+            ring_high_water={place: grabber.ring.high_water for place, grabber in self._grabbers.items()},
+            ring_slots=self._config.ring_slots,
+            ring_locked=all(grabber.ring.locked for grabber in self._grabbers.values()),
+            seconds=seconds,
+            failures=self._failures,
+        )
+
+    def _triggers_so_far(self) -> int:
+        return next(iter(self._ledger.accounts().values())).triggers
+
+    def _flush_aux(self) -> None:
+        messages = self._aux.take()
+        if messages:
+            for recorder in self._recorders.values():
+                recorder.put_aux(messages)
+
+    def _report(self) -> None:
+        accounts = self._ledger.accounts()
+        statuses = [
+            Diagnostic(
+                1 if account.lost_total else 0,
+                "/".join(place),
+                "frames lost" if account.lost_total else "recording",
+                (
+                    ("recorded", str(account.recorded)),
+                    ("lost", json.dumps(account.lost)),
+                    ("ring_in_use", str(self._grabbers[place].ring.in_use)),
+                ),
+            )
+            for place, account in accounts.items()
+        ]
+        statuses += [
+            Diagnostic(
+                2 if recorder.failure else 0,
+                f"disk {side}",
+                str(recorder.failure) if recorder.failure else recorder.write_mode,
+                (("queued", str(recorder.queued)), ("last_write_us", str(recorder.statistics.last_us))),
+            )
+            for side, recorder in self._recorders.items()
+        ]
+        self._aux.diagnostics(tuple(statuses))
+        recorded = sum(account.recorded for account in accounts.values())
+        lost = sum(account.lost_total for account in accounts.values())
+        depth = max(grabber.ring.in_use for grabber in self._grabbers.values())
+        self._progress(
+            f"triggers {self._triggers_so_far()}  recorded {recorded}  lost {lost}  "
+            f"ring {depth}/{self._config.ring_slots}"
+        )
+
+    def _provenance(self, board_name: str) -> dict[str, str]:
+        return {
+            "flight": self.flight,
+            "flight_id": self._flight_id,
+            "version": _version(),
+            "commit": _commit(),
+            "host": platform.node(),
+            "kernel": platform.release(),
+            "python": platform.python_version(),
+            "config": self._loaded.text,
+            "config_sha256": self._loaded.sha256,
+            "trigger_board": board_name,
+            "cameras": " ".join("/".join(place) for place in self._cameras),
+            "serials": json.dumps(
+                {"/".join(place): description.serial for place, (_, description) in self._cameras.items()}
+            ),
+            "models": json.dumps(
+                {"/".join(place): description.model for place, (_, description) in self._cameras.items()}
+            ),
+            "tai_offset_s": "unknown",
+            "time_base": "UTC of the host's system clock",
+        }
+
+
+def _version() -> str:
+    try:
+        return version("wingshape")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _commit() -> str:
+    """The source's commit where it runs from a checkout, else empty."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

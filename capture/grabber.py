@@ -1,0 +1,152 @@
+"""The read thread of one camera: filled buffers to numbered, sealed frames in the write queue."""
+
+import threading
+from dataclasses import dataclass
+
+from capture.camera.base import Camera, CameraDescription, FrameStatus, Grab
+from capture.clock import Clock
+from capture.config import DRIVER_BUFFERS
+from capture.errors import CameraLost
+from capture.ledger import Ledger, Place
+from capture.numbering import FrameNumbering, Numbered
+from capture.record import Frame, LossStage, PtpState
+from capture.recorder import FrameItem, Recorder
+from capture.ring import Ring
+from capture.segment import FrameLayout
+from capture.trigger import TriggerLog
+from capture.worker import Worker
+
+GRAB_TIMEOUT_S = 0.1
+
+
+class SideGate:
+    """Keeps stereo sets whole: the first camera of a side to get a trigger's frame decides for both.
+
+    A set is let in when every ring of the side has a slot to spare; otherwise both frames are lost at the ring.
+    """
+
+    _REMEMBERED = 64
+
+    def __init__(self, rings: list[Ring]) -> None:
+        self._rings = rings
+        self._decisions: dict[int, bool] = {}
+        self._mutex = threading.Lock()
+
+    def admits(self, index: int) -> bool:
+        """Whether the frames of this trigger are kept."""
+        with self._mutex:
+            if index not in self._decisions:
+                self._decisions[index] = all(ring.free > 0 for ring in self._rings)
+                while len(self._decisions) > self._REMEMBERED:
+                    del self._decisions[next(iter(self._decisions))]
+            return self._decisions[index]
+
+
+@dataclass
+class GrabCounts:
+    """What the read thread has seen."""
+
+    grabbed: int = 0
+    incomplete: int = 0
+    duplicates: int = 0
+
+
+class Grabber(Worker):
+    """Owns one camera from ``start`` on. Keeps the driver supplied with empty slots."""
+
+    def __init__(
+        self,
+        place: Place,
+        camera: Camera,
+        description: CameraDescription,
+        ring: Ring,
+        layout: FrameLayout,
+        gate: SideGate,
+        triggers: TriggerLog,
+        ledger: Ledger,
+        recorder: Recorder,
+        clock: Clock,
+    ) -> None:
+        super().__init__(f"read-{place[0]}-{place[1]}")
+        self.place = place
+        self.ring = ring
+        self.counts = GrabCounts()
+        self._camera = camera
+        self._description = description
+        self._layout = layout
+        self._gate = gate
+        self._ledger = ledger
+        self._recorder = recorder
+        self._clock = clock
+        self._numbering = FrameNumbering(description, triggers)
+
+    def arm(self) -> None:
+        """Give the driver its buffers and make the camera ready for triggers. Before ``start``."""
+        for _ in range(DRIVER_BUFFERS):
+            slot = self.ring.take()
+            if slot is not None:
+                self._queue(slot)
+        self._camera.arm()
+
+    def work(self) -> None:
+        """Grab until asked to stop.
+
+        Raises:
+            CameraLost: the camera is gone. Its further triggers are booked when the ledger is closed.
+        """
+        try:
+            while not self.stop_requested.is_set():
+                grab = self._camera.grab(GRAB_TIMEOUT_S)
+                if grab is not None:
+                    self._take(grab)
+        except CameraLost as error:
+            raise CameraLost(f"{'/'.join(self.place)}: {error}") from error
+        finally:
+            self._camera.disarm()
+
+    def _take(self, grab: Grab) -> None:
+        self.counts.grabbed += 1
+        numbered = self._numbering.number(grab)
+        if numbered is None or not self._ledger.arrived(self.place, numbered.index, numbered.lost_in_delivery):
+            self.counts.duplicates += 1
+            self._queue(grab.slot)
+            return
+        if grab.status is not FrameStatus.COMPLETE:
+            self.counts.incomplete += 1
+            self._lose(grab, numbered, LossStage.USB, "the driver delivered an incomplete buffer")
+            return
+        fresh = self.ring.take() if self._gate.admits(numbered.index) else None
+        if fresh is None:
+            self._lose(grab, numbered, LossStage.RING, "ring full: the disk is behind by more than ring.stall_s")
+            return
+        self._queue(fresh)
+        self._hand_over(grab, numbered)
+
+    def _hand_over(self, grab: Grab, numbered: Numbered) -> None:
+        row_time_ns = self._description.row_time_ns
+        frame = Frame(
+            trigger_index=numbered.index,
+            device_frame_id=grab.frame_id,
+            device_ticks=grab.device_ticks,
+            trigger_time_ns=numbered.trigger_ns,
+            exposure_start_ns=numbered.trigger_ns,
+            receive_time_ns=grab.receive_ns,
+            time_sigma_ns=-1,
+            exposure_us=grab.exposure_us,
+            row_time_ns=row_time_ns,
+            ring_depth=self.ring.in_use,
+            previous_write_us=self._recorder.statistics.last_us,
+            gain_db=grab.gain_db,
+            ptp_state=PtpState.UNKNOWN,
+            status=grab.status,
+        )
+        middle_ns = frame.mid_exposure_ns + row_time_ns * (self._description.height - 1) // 2
+        sealed = self._layout.seal(self.ring.slot(grab.slot), frame, middle_ns)
+        self._recorder.put(FrameItem(self.place, numbered.index, self.ring, grab.slot, sealed))
+
+    def _lose(self, grab: Grab, numbered: Numbered, stage: LossStage, cause: str) -> None:
+        self._ledger.lost(self.place, numbered.index, stage, cause)
+        self._queue(grab.slot)
+
+    def _queue(self, slot: int) -> None:
+        self._camera.queue(slot, self._layout.pixels(self.ring.slot(slot)))

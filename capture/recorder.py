@@ -1,0 +1,247 @@
+"""The write thread of one disk: sealed frames and aux batches to segments, with rotation and a guard of free space."""
+
+import os
+import queue
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from capture.clock import Clock
+from capture.config import DiskConfig
+from capture.errors import DiskError
+from capture.ledger import Ledger, Place
+from capture.record import (
+    DIAGNOSTICS_TOPIC,
+    LOSS_TOPIC,
+    TRIGGER_TOPIC,
+    LossStage,
+    camera_info_topic,
+    encode_camera_info,
+    frame_topic,
+    image_topic,
+)
+from capture.ring import Ring
+from capture.segment import Channel, SealedFrame, SegmentWriter, SmallMessage
+from capture.worker import Worker
+
+AUX_CHANNELS = (
+    Channel(1, TRIGGER_TOPIC, "wingshape_msgs/msg/Trigger"),
+    Channel(2, LOSS_TOPIC, "wingshape_msgs/msg/Loss"),
+    Channel(3, DIAGNOSTICS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray"),
+)
+AUX_QUEUE = 1024
+_SPACE_CHECK_EVERY = 32  # frames
+
+
+@dataclass(frozen=True)
+class FrameItem:
+    """A frame on its way to the disk."""
+
+    place: Place
+    index: int
+    ring: Ring
+    slot: int
+    sealed: SealedFrame
+
+
+@dataclass(frozen=True)
+class AuxItem:
+    """Small messages on their way to the disk."""
+
+    messages: tuple[SmallMessage, ...]
+
+
+def camera_channels(names: Sequence[str], side: str) -> tuple[Channel, ...]:
+    """Channels of a side's segment: image, frame and camera_info of each camera, ids 1, 2, 3, …"""
+    channels: list[Channel] = []
+    for name in names:
+        for topic, type_name in (
+            (image_topic(side, name), "sensor_msgs/msg/Image"),
+            (frame_topic(side, name), "wingshape_msgs/msg/Frame"),
+            (camera_info_topic(side, name), "sensor_msgs/msg/CameraInfo"),
+        ):
+            channels.append(Channel(len(channels) + 1, topic, type_name))
+    return tuple(channels)
+
+
+@dataclass
+class WriteStatistics:
+    """How the disk is doing."""
+
+    frames: int = 0
+    bytes: int = 0
+    last_us: int = 0
+    latencies_us: deque[int] = field(default_factory=lambda: deque(maxlen=100_000))
+
+
+class Recorder(Worker):
+    """One disk's writer. Frames are handed to it with ``put``, which never blocks."""
+
+    def __init__(
+        self,
+        side: str,
+        folder: Path,
+        cameras: Sequence[str],
+        size: tuple[int, int],
+        disk: DiskConfig,
+        provenance: dict[str, str],
+        ledger: Ledger,
+        clock: Clock,
+        queue_bound: int,
+        calibration: Path | None = None,
+    ) -> None:
+        super().__init__(f"write-{side}")
+        self.side = side
+        self.folder = folder
+        self.failure: DiskError | None = None
+        self.statistics = WriteStatistics()
+        self.segments: list[SegmentWriter] = []
+        self.aux_dropped = 0
+        self.write_mode: str = disk.write
+        self._cameras = tuple(cameras)
+        self._size = size
+        self._disk = disk
+        self._provenance = provenance
+        self._ledger = ledger
+        self._clock = clock
+        self._calibration = calibration
+        self._queue: queue.Queue[FrameItem | AuxItem] = queue.Queue(queue_bound + AUX_QUEUE)
+        self._segment_started_s = 0.0
+        self._current: SegmentWriter | None = None
+        self.aux = SegmentWriter(
+            folder / "aux_0000.mcap", AUX_CHANNELS, {**provenance, "side": side, "segment": "0"}, "buffered"
+        )
+        self._open_segment()
+
+    def put(self, item: FrameItem) -> None:
+        """Hand a frame over. There is always room: every item owns a ring slot."""
+        self._queue.put_nowait(item)
+
+    def put_aux(self, messages: tuple[SmallMessage, ...]) -> None:
+        """Hand small messages over; counted as dropped when the disk has been stuck for very long."""
+        try:
+            self._queue.put_nowait(AuxItem(messages))
+        except queue.Full:
+            self.aux_dropped += len(messages)
+
+    @property
+    def queued(self) -> int:
+        """Items waiting for the disk."""
+        return self._queue.qsize()
+
+    def work(self) -> None:
+        """Write until asked to stop and nothing is left."""
+        while True:
+            try:
+                item = self._queue.get(timeout=0.1)
+            except queue.Empty:
+                if self.stop_requested.is_set():
+                    return
+                continue
+            if isinstance(item, FrameItem):
+                self._take_frame(item)
+            else:
+                self._take_aux(item)
+
+    def close(self, end: dict[str, str]) -> None:
+        """Close both files, ``end`` as aux's last record. After ``stop``; a failing disk is kept in ``failure``."""
+        try:
+            if self._current is not None:
+                self._current.close()
+            self.aux.write_metadata("wingshape_end", end)
+            self.aux.close()
+        except DiskError as error:
+            self._fail(error)
+
+    def _take_frame(self, item: FrameItem) -> None:
+        if self.failure is None:
+            try:
+                self._write(item)
+            except DiskError as error:
+                self._fail(error)
+        if self.failure is not None:
+            self._ledger.lost(item.place, item.index, LossStage.DISK, str(self.failure))
+        else:
+            self._ledger.recorded(item.place, item.index)
+        item.ring.give_back(item.slot)
+
+    def _write(self, item: FrameItem) -> None:
+        segment = self._segment_with_room()
+        begin_s = self._clock.monotonic_s()
+        segment.write_frame(item.sealed)
+        took_us = int((self._clock.monotonic_s() - begin_s) * 1e6)
+        done = self.statistics
+        done.frames += 1
+        done.bytes += len(item.sealed.slot)
+        done.last_us = took_us
+        done.latencies_us.append(took_us)
+
+    def _take_aux(self, item: AuxItem) -> None:
+        try:
+            self.aux.write_batch(item.messages)
+        except DiskError as error:
+            self.aux_dropped += len(item.messages)
+            self._fail(error)
+
+    def _segment_with_room(self) -> SegmentWriter:
+        if self.statistics.frames % _SPACE_CHECK_EVERY == 0:
+            self._guard_space()
+        segment = self._current
+        old = self._clock.monotonic_s() - self._segment_started_s > self._disk.segment_s
+        if segment is None or old or segment.bytes_written > self._disk.segment_mb * 1e6:
+            if segment is not None:
+                segment.close()
+            segment = self._open_segment()
+        return segment
+
+    def _open_segment(self) -> SegmentWriter:
+        number = len(self.segments)
+        channels = camera_channels(self._cameras, self.side)
+        segment = SegmentWriter(
+            self.folder / f"{self.side}_{number:04d}.mcap",
+            channels,
+            {**self._provenance, "side": self.side, "segment": str(number)},
+            self._disk.write,
+        )
+        self.write_mode = segment.write_mode
+        now_ns = self._clock.utc_ns()
+        if self._calibration is not None:
+            segment.attach(self._calibration, now_ns)
+        height, width = self._size
+        segment.write_batch(
+            [
+                SmallMessage(
+                    3 * number_of_camera + 3,
+                    number,
+                    now_ns,
+                    now_ns,
+                    encode_camera_info(now_ns, f"{self.side}_{name}", height, width),
+                )
+                for number_of_camera, name in enumerate(self._cameras)
+            ]
+        )
+        self.segments.append(segment)
+        self._current = segment
+        self._segment_started_s = self._clock.monotonic_s()
+        return segment
+
+    def _guard_space(self) -> None:
+        try:
+            space = os.statvfs(self.folder)
+        except OSError as error:
+            raise DiskError(f"{self.folder}: the disk is gone ({error.strerror}): check its connection") from error
+        free_mb = space.f_bavail * space.f_frsize / 1e6
+        if free_mb < self._disk.reserve_mb:
+            raise DiskError(
+                f"{self.folder}: {free_mb:.0f} MB free is less than the reserve of {self._disk.reserve_mb:.0f} MB: "
+                "free space on this disk"
+            )
+
+    def _fail(self, error: DiskError) -> None:
+        """This side is over: what is on the disk stays readable, the other side goes on."""
+        if self.failure is None:
+            self.failure = error
+        if self._current is not None:
+            self._current.abandon()
+            self._current = None

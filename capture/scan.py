@@ -1,0 +1,152 @@
+"""One MCAP file to its chunks and messages, record by record, up to where it is whole; what is wrong is listed."""
+
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+
+from capture.errors import RecordingError
+from capture.record import PROVENANCE
+from capture.segment import MAGIC
+
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQIIQ")
+FOOTER_BYTES = 9 + 20 + len(MAGIC)
+
+
+@dataclass(frozen=True)
+class ScannedMessage:
+    """A message as it lies in the file. ``data`` is only valid while the scan goes on."""
+
+    topic: str
+    sequence: int
+    log_ns: int
+    publish_ns: int
+    data: memoryview
+
+
+@dataclass
+class Scan:
+    """What a pass over a file found, complete once ``messages`` is exhausted."""
+
+    path: Path
+    size: int
+    provenance: dict[str, str] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    topics: dict[int, str] = field(default_factory=dict)
+    chunks: int = 0
+    closed: bool = False  # has DataEnd, summary and footer
+    problems: list[str] = field(default_factory=list)
+
+
+def scan(path: Path) -> tuple[Scan, Iterator[ScannedMessage]]:
+    """Begin a pass over ``path``. Iterate the messages to the end, then read the ``Scan``.
+
+    Raises:
+        RecordingError: the file cannot be opened, or is not MCAP from its first bytes on.
+    """
+    try:
+        with path.open("rb") as file:
+            size = path.stat().st_size
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else None
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
+    if data is None or data[: len(MAGIC)] != MAGIC:
+        raise RecordingError(f"{path}: not an MCAP file (or its beginning is damaged): restore it from a copy")
+    found = Scan(path, size)
+    return found, _messages(found, memoryview(data))
+
+
+def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
+    at = len(MAGIC)
+    while at + _RECORD.size <= found.size:
+        opcode, length = _RECORD.unpack_from(data, at)
+        body_at, end = at + _RECORD.size, at + _RECORD.size + length
+        if opcode == 0 or end > found.size:
+            break
+        body = data[body_at:end]
+        if opcode == Opcode.CHUNK:
+            yield from _chunk(found, body, at)
+        elif opcode == Opcode.MESSAGE:
+            found.problems.append(f"byte {at}: a message outside a chunk, which no index knows of")
+        elif opcode == Opcode.METADATA:
+            record = records.Metadata.read(_stream(body))
+            found.metadata[record.name] = record.metadata
+            if record.name == PROVENANCE:
+                found.provenance = record.metadata
+        elif opcode == Opcode.CHANNEL:
+            channel = records.Channel.read(_stream(body))
+            found.topics[channel.id] = channel.topic
+        elif opcode == Opcode.DATA_END:
+            found.closed = _check_summary(found, data, end)
+            return
+        at = end
+    found.problems.append(
+        f"ends at byte {at} of {found.size} without its closing records: it was not closed, or was cut"
+    )
+
+
+def _chunk(found: Scan, body: memoryview, at: int) -> Iterator[ScannedMessage]:
+    if len(body) < _CHUNK.size:
+        found.problems.append(f"byte {at}: a chunk too short for its own header")
+        return
+    _, _, size, crc, compression, stored = _CHUNK.unpack_from(body)
+    content = body[_CHUNK.size :]
+    if compression or size != stored or len(content) != size:
+        found.problems.append(f"byte {at}: a chunk whose lengths do not agree")
+        return
+    if zlib.crc32(content) != crc:
+        found.problems.append(f"byte {at}: a chunk whose content differs from its CRC")
+        return
+    found.chunks += 1
+    inner = 0
+    while inner + _RECORD.size <= size:
+        opcode, length = _RECORD.unpack_from(content, inner)
+        start = inner + _RECORD.size
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content, start)
+            yield ScannedMessage(
+                found.topics.get(channel, f"channel {channel}"),
+                sequence,
+                log_ns,
+                publish_ns,
+                content[start + _MESSAGE.size : start + length],
+            )
+        inner = start + length
+
+
+def _check_summary(found: Scan, data: memoryview, at: int) -> bool:
+    """Whether the summary and footer that begin at ``at`` are whole; what is wrong goes to the problems."""
+    footer_at = found.size - FOOTER_BYTES
+    if footer_at < at or bytes(data[found.size - len(MAGIC) :]) != MAGIC:
+        found.problems.append(f"byte {at}: the summary is cut short")
+        return False
+    _, summary_at, _, crc = struct.unpack_from("<9sQQI", data, footer_at)
+    if summary_at != at or zlib.crc32(data[at : footer_at + 25]) != crc:
+        found.problems.append(f"byte {at}: the summary differs from its CRC")
+        return False
+    indexed = sum(1 for opcode in _opcodes(data, at, footer_at) if opcode == Opcode.CHUNK_INDEX)
+    if indexed != found.chunks:
+        found.problems.append(f"the summary names {indexed} chunks, the file holds {found.chunks} good ones")
+        return False
+    return True
+
+
+def _opcodes(data: memoryview, at: int, end: int) -> Iterator[int]:
+    while at + _RECORD.size <= end:
+        opcode, length = _RECORD.unpack_from(data, at)
+        yield opcode
+        at += _RECORD.size + length
+
+
+def _stream(body: memoryview) -> ReadDataStream:
+    import io
+
+    return ReadDataStream(io.BytesIO(bytes(body)))

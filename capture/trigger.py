@@ -1,0 +1,186 @@
+"""The trigger board's driver: a serial port to pulses with index and time."""
+
+import queue
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import serial
+
+from capture.clock import Clock
+from capture.errors import TriggerBoardError
+from capture.record import Trigger
+from capture.trigger_protocol import PROTOCOL_VERSION, GarbledLine, Pulse, decode_line, encode_line, parse_pulse
+from capture.worker import Worker
+
+REPLY_TIMEOUT_S = 2.0
+_PULSES_KEPT = 4096
+
+
+class TriggerLog:
+    """Which trigger was given when. Thread-safe; remembers the last few thousand pulses."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self.period_ns = round(1e9 / rate_hz)
+        self._pulses: OrderedDict[int, int] = OrderedDict()
+        self._changed = threading.Condition()
+
+    def add(self, pulse: Pulse) -> None:
+        """Book a pulse."""
+        with self._changed:
+            self._pulses[pulse.index] = pulse.actual_ns
+            while len(self._pulses) > _PULSES_KEPT:
+                self._pulses.popitem(last=False)
+            self._changed.notify_all()
+
+    def nearest(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
+        """Index and time of the trigger nearest to ``time_ns``.
+
+        Waits up to ``wait_s`` for the board's report of it; after that its time is extrapolated with the period. None
+        when the board never reported a pulse.
+        """
+        with self._changed:
+            found = self._guess(time_ns)
+            if found is None or found[0] not in self._pulses:
+                self._changed.wait_for(lambda: (g := self._guess(time_ns)) is not None and g[0] in self._pulses, wait_s)
+                found = self._guess(time_ns)
+            return found
+
+    def latest_before(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
+        """Index and time of the last trigger at or before ``time_ns``; None when there was none."""
+        found = self.nearest(time_ns, wait_s)
+        if found is None or found[1] <= time_ns:
+            return found
+        index = found[0] - 1
+        with self._changed:
+            known = self._pulses.get(index)
+            return None if index < next(iter(self._pulses)) else (index, known or found[1] - self.period_ns)
+
+    def _guess(self, time_ns: int) -> tuple[int, int] | None:
+        if not self._pulses:
+            return None
+        index, at = next(reversed(self._pulses.items()))
+        steps = round((time_ns - at) / self.period_ns)
+        index, at = index + steps, at + steps * self.period_ns
+        return index, self._pulses.get(index, at)
+
+
+@dataclass(frozen=True)
+class BoardCount:
+    """What the board says it has done: the next pulse's index, and its own counter of edges."""
+
+    next_index: int
+    counter: int
+
+
+class TriggerBoard(Worker):
+    """The board behind a serial port. ``on_pulse`` is called from the reading thread."""
+
+    def __init__(self, port: str, clock: Clock, on_pulse: Callable[[Pulse, Trigger], None]) -> None:
+        super().__init__("trigger-board")
+        self.port = port
+        self.garbled_lines = 0
+        self._clock = clock
+        self._on_pulse = on_pulse
+        self._replies: queue.SimpleQueue[tuple[str, ...]] = queue.SimpleQueue()
+        try:
+            self._serial = serial.Serial(port, baudrate=115200, timeout=0.1, write_timeout=1.0)
+        except (serial.SerialException, OSError) as error:
+            raise TriggerBoardError(
+                f"{port}: the trigger board's port cannot be opened ({error}): check `trigger.port` and the cable"
+            ) from error
+
+    def hello(self) -> str:
+        """Check the protocol version; the board's name."""
+        words = self._ask("HELLO")
+        if len(words) < 2 or words[0] != str(PROTOCOL_VERSION):
+            raise TriggerBoardError(
+                f"{self.port}: the board speaks protocol {words[:1]}, not {PROTOCOL_VERSION}: update its firmware"
+            )
+        return " ".join(words[1:])
+
+    def set_rate(self, rate_hz: float) -> None:
+        """Set the pulse rate."""
+        self._ask("RATE", str(round(rate_hz * 1000)))
+
+    def begin(self, first_index: int, count: int = 0) -> None:
+        """Give pulses from ``first_index`` on; ``count`` of them, or without end."""
+        self._ask("START", str(first_index), str(count))
+
+    def end(self) -> BoardCount:
+        """No pulse after this returns."""
+        words = self._ask("STOP")
+        return self._count(words)
+
+    def status(self) -> tuple[bool, BoardCount]:
+        """Whether the board is running, and its counts."""
+        words = self._ask("STATUS")
+        return words[:1] == ("1",), self._count(words[1:])
+
+    def close(self) -> None:
+        """Let go of the port. Safe to call twice."""
+        self.stop(deadline_s=1.0)
+        self._serial.close()
+
+    def work(self) -> None:
+        """Read lines until asked to stop.
+
+        Raises:
+            TriggerBoardError: the port is gone.
+        """
+        rest = b""
+        while not self.stop_requested.is_set():
+            try:
+                rest += self._serial.read(self._serial.in_waiting or 1)
+            except (serial.SerialException, OSError) as error:
+                raise TriggerBoardError(f"{self.port}: the trigger board is gone ({error}): check its cable") from error
+            *lines, rest = rest.split(b"\n")
+            for line in lines:
+                self._take(line)
+            if len(rest) > 4096:  # no line end for far too long: not our protocol
+                self.garbled_lines += 1
+                rest = b""
+
+    def _take(self, line: bytes) -> None:
+        try:
+            words = decode_line(line)
+            if words[0] == "PULSE":
+                pulse = parse_pulse(words)
+                self._on_pulse(
+                    pulse,
+                    Trigger(pulse.index, pulse.counter, pulse.commanded_ns, pulse.actual_ns, self._clock.utc_ns()),
+                )
+            else:
+                self._replies.put(words)
+        except GarbledLine:
+            self.garbled_lines += 1
+
+    def _ask(self, *words: str) -> tuple[str, ...]:
+        while not self._replies.empty():  # late answers to questions that were given up
+            self._replies.get()
+        try:
+            self._serial.write(encode_line(*words))
+        except (serial.SerialException, OSError) as error:
+            raise TriggerBoardError(f"{self.port}: the trigger board is gone ({error}): check its cable") from error
+        deadline = self._clock.monotonic_s() + REPLY_TIMEOUT_S
+        while (left := deadline - self._clock.monotonic_s()) > 0:
+            try:
+                reply = self._replies.get(timeout=left)
+            except queue.Empty:
+                break
+            if reply[:2] == ("OK", words[0]):
+                return reply[2:]
+            if reply[0] == "ERR":
+                raise TriggerBoardError(f"{self.port}: the board refuses {' '.join(words)}: {' '.join(reply[1:])}")
+        raise TriggerBoardError(
+            f"{self.port}: the trigger board did not answer {words[0]} within {REPLY_TIMEOUT_S:g} s: "
+            "check that it is powered and that no other program has its port"
+        )
+
+    def _count(self, words: tuple[str, ...]) -> BoardCount:
+        try:
+            next_index, counter = (int(word) for word in words)
+        except ValueError as error:
+            raise TriggerBoardError(f"{self.port}: the board's counts are no numbers: {' '.join(words)}") from error
+        return BoardCount(next_index, counter)

@@ -1,0 +1,193 @@
+"""A flight's folders to a certificate: is every trigger of every camera recorded once, or lost with a cause?"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from capture.errors import RecordingError
+from capture.flight import find_folders
+from capture.record import LOSS_TOPIC, TRIGGER_TOPIC, Frame, Loss, Trigger, decode_image
+from capture.scan import Scan, ScannedMessage, scan
+
+_PROBLEMS_KEPT = 100
+
+
+@dataclass
+class CameraReport:
+    """What the files say of one camera."""
+
+    recorded: int = 0
+    lost: dict[str, int] = field(default_factory=dict)
+    width: int = 0
+    height: int = 0
+    indices: set[int] = field(default_factory=set)
+    lost_indices: dict[int, Loss] = field(default_factory=dict)
+
+
+@dataclass
+class FlightReport:
+    """What is in a flight's folders, and everything that is wrong with it."""
+
+    folders: list[Path]
+    files: list[Scan] = field(default_factory=list)
+    cameras: dict[str, CameraReport] = field(default_factory=dict)
+    triggers: int = 0
+    first_trigger_ns: int = 0
+    last_trigger_ns: int = 0
+    provenance: dict[str, str] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.problems
+
+    @property
+    def recorded(self) -> int:
+        """Frames in the files."""
+        return sum(camera.recorded for camera in self.cameras.values())
+
+    @property
+    def lost(self) -> int:
+        """Frames that are booked as lost."""
+        return sum(len(camera.lost_indices) for camera in self.cameras.values())
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all files."""
+        return sum(file.size for file in self.files)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "folders": [str(folder) for folder in self.folders],
+            "whole": self.whole,
+            "triggers": self.triggers,
+            "frames_recorded": self.recorded,
+            "frames_lost": self.lost,
+            "first_trigger_ns": self.first_trigger_ns,
+            "last_trigger_ns": self.last_trigger_ns,
+            "bytes": self.size_bytes,
+            "cameras": {
+                name: {
+                    "recorded": camera.recorded,
+                    "lost": camera.lost,
+                    "width": camera.width,
+                    "height": camera.height,
+                }
+                for name, camera in sorted(self.cameras.items())
+            },
+            "files": [
+                {"path": str(file.path), "bytes": file.size, "chunks": file.chunks, "closed": file.closed}
+                for file in self.files
+            ],
+            "write_modes": sorted({file.provenance.get("write_mode", "unknown") for file in self.files}),
+            "flight": self.provenance.get("flight", ""),
+            "version": self.provenance.get("version", ""),
+            "problems": self.problems,
+        }
+
+
+def inspect(paths: Sequence[Path]) -> FlightReport:
+    """Read every byte of a flight, on all the disks given, and check it.
+
+    Every chunk's CRC, every summary, each frame's identity (sequence, Frame and Image agree), and the books: for each
+    camera each trigger index of the board's range is recorded once or lost once, never both, never neither.
+
+    Raises:
+        RecordingError: there is nothing to read.
+    """
+    report = FlightReport(find_folders(paths))
+    pulses: dict[int, Trigger] = {}
+    ends: list[dict[str, str]] = []
+    for folder in report.folders:
+        for path in sorted(folder.glob("*.mcap")):
+            try:
+                found, messages = scan(path)
+            except RecordingError as error:
+                report.problems.append(str(error))
+                continue
+            for message in messages:
+                _take(report, path, message, pulses)
+            report.files.append(found)
+            report.problems += [f"{path}: {problem}" for problem in found.problems]
+            if "wingshape_end" in found.metadata:
+                ends.append(found.metadata["wingshape_end"])
+            report.provenance = report.provenance or found.provenance
+    _check_one_flight(report)
+    _check_books(report, pulses, ends)
+    del report.problems[_PROBLEMS_KEPT:]
+    return report
+
+
+def _take(report: FlightReport, path: Path, message: ScannedMessage, pulses: dict[int, Trigger]) -> None:
+    try:
+        if message.topic == TRIGGER_TOPIC:
+            pulse = Trigger.decode(message.data)
+            pulses[pulse.index] = pulse
+        elif message.topic == LOSS_TOPIC:
+            loss = Loss.decode(message.data)
+            _camera(report, loss.side, loss.camera).lost_indices[loss.trigger_index] = loss
+        elif message.topic.endswith("/image_raw"):
+            _, side, name, _ = message.topic.split("/")
+            image = decode_image(message.data)
+            camera = _camera(report, side, name)
+            camera.width, camera.height = image.width, image.height
+            if message.sequence in camera.indices:
+                report.problems.append(f"{path}: {side}/{name} trigger {message.sequence} is recorded twice")
+            camera.indices.add(message.sequence)
+            camera.recorded += 1
+        elif message.topic.endswith("/frame"):
+            frame = Frame.decode(message.data)
+            if frame.trigger_index & 0xFFFFFFFF != message.sequence or frame.trigger_time_ns != message.publish_ns:
+                report.problems.append(
+                    f"{path}: {message.topic} trigger {message.sequence}: Frame and Message disagree"
+                )
+    except ValueError as error:
+        report.problems.append(f"{path}: {message.topic} sequence {message.sequence} cannot be decoded: {error}")
+
+
+def _camera(report: FlightReport, side: str, name: str) -> CameraReport:
+    return report.cameras.setdefault(f"{side}/{name}", CameraReport())
+
+
+def _check_one_flight(report: FlightReport) -> None:
+    flights = {file.provenance.get("flight_id", "?") for file in report.files}
+    if len(flights) > 1:
+        report.problems.append(f"the folders hold {len(flights)} different flights: give those of one flight")
+    expected = set(report.provenance.get("cameras", "").split())
+    given = {file.provenance.get("side", "") for file in report.files}
+    for name in sorted(expected):
+        if name.split("/")[0] not in given:
+            report.problems.append(f"{name}: the folder of its disk was not given: name it too")
+        else:
+            report.cameras.setdefault(name, CameraReport())
+
+
+def _check_books(report: FlightReport, pulses: dict[int, Trigger], ends: list[dict[str, str]]) -> None:
+    if pulses:
+        report.first_trigger_ns = pulses[min(pulses)].reported_time_ns
+        report.last_trigger_ns = pulses[max(pulses)].reported_time_ns
+    if ends:
+        first, after = int(ends[0]["first_index"]), int(ends[0]["next_index"])
+        edges = int(ends[0]["counter_end"]) - int(ends[0]["counter_begin"])
+        if edges != after - first:
+            report.problems.append(f"the board's counter went on by {edges}, its index by {after - first}")
+    else:
+        report.problems.append("no file has the board's final count: the recording was not closed")
+        first, after = min(pulses, default=0), max(pulses, default=-1) + 1
+    report.triggers = after - first
+    unreported = report.triggers - sum(1 for index in pulses if first <= index < after)
+    if unreported:
+        report.problems.append(f"{unreported} triggers have no /trigger message: lines from the board were lost")
+    for name, camera in sorted(report.cameras.items()):
+        camera.lost = dict(Counter(loss.stage for loss in camera.lost_indices.values()))
+        for index in range(first, after):
+            if (index in camera.indices) + (index in camera.lost_indices) != 1:
+                state = "both recorded and lost" if index in camera.indices else "neither recorded nor booked as lost"
+                report.problems.append(f"{name} trigger {index} is {state}")
+        strays = [index for index in camera.indices if not first <= index < after]
+        if strays:
+            report.problems.append(f"{name}: {len(strays)} frames of triggers that the board never gave")

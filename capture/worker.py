@@ -1,0 +1,40 @@
+"""A named thread that hands its exception to its owner and is joined under a deadline."""
+
+import threading
+from abc import ABC, abstractmethod
+
+
+class Worker(ABC):
+    """One job in one thread. The owner starts it, watches ``error``, and joins it."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.error: BaseException | None = None
+        self.stop_requested = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    @abstractmethod
+    def work(self) -> None:
+        """The job. Returns soon after ``stop_requested`` is set, or raises."""
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self, deadline_s: float) -> bool:
+        """Ask the job to end, wait for it, and say whether it ended in time."""
+        self.stop_requested.set()
+        if self._thread.ident is not None:
+            self._thread.join(deadline_s)
+        return not self._thread.is_alive()
+
+    @property
+    def running(self) -> bool:
+        """Whether the job is still going on."""
+        return self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            self.work()
+        except BaseException as error:  # the owner decides what it means
+            self.error = error

@@ -1,0 +1,158 @@
+"""The recorder end to end on a rig of fakes: what was shown is in the files, what was lost is booked, byte for byte."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from capture.clock import SystemClock
+from capture.config import load_config
+from capture.daemon import Recording, RecordingResult, StopRule
+from capture.errors import CameraError, TriggerBoardError, UsageError
+from capture.verify import inspect
+
+TRIGGERS = 25
+
+
+def record(config: Path, triggers: int = TRIGGERS) -> RecordingResult:
+    return Recording(load_config(config), SystemClock(), lambda _: None).run(StopRule(threading.Event(), triggers))
+
+
+def frames_of(folder: Path) -> dict[tuple[str, int], bytes]:
+    """Pixels by camera and trigger, through the stock readers."""
+    frames = {}
+    for path in sorted(folder.glob("*_*.mcap")):
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+            for _, channel, message, image in reader.iter_decoded_messages():
+                if channel.topic.endswith("image_raw"):
+                    assert (image.height, image.width, image.encoding) == (48, 64, "mono8")
+                    frames[image.header.frame_id, message.sequence] = bytes(image.data)
+    return frames
+
+
+def test_every_frame_shown_is_recorded_with_its_own_content(write_config, rig, tmp_path, pixels_of):
+    result = record(write_config())
+    assert (result.triggers, result.recorded, result.lost, result.failures) == (TRIGGERS, 4 * TRIGGERS, 0, [])
+    frames = frames_of(tmp_path / "ssd_left/test") | frames_of(tmp_path / "ssd_right/test")
+    assert len(frames) == 4 * TRIGGERS
+    for (camera, index), pixels in frames.items():
+        assert pixels == pixels_of(camera, index).tobytes()
+    report = inspect([tmp_path])
+    assert report.problems == []
+    assert (report.triggers, report.recorded, report.lost) == (TRIGGERS, 4 * TRIGGERS, 0)
+
+
+def test_faults_are_booked_at_their_stage_and_the_certificate_holds(write_config, rig, tmp_path, pixels_of):
+    rig.missed = {("left_cam0", 0), ("left_cam0", 5), ("left_cam0", 6), ("left_cam1", 24)}
+    rig.undelivered = {("left_cam1", 7), ("left_cam1", 8)}
+    rig.incomplete = {("right_cam0", 9)}
+    rig.repeated = {("right_cam1", 10)}
+    result = record(write_config(rate_hz=50))
+    lost = {"/".join(place): account.lost for place, account in result.accounts.items()}
+    assert lost == {
+        "left/cam0": {"camera": 3},
+        "left/cam1": {"usb": 2, "camera": 1},
+        "right/cam0": {"usb": 1},
+        "right/cam1": {},
+    }
+    assert all(account.balanced for account in result.accounts.values())
+    report = inspect([tmp_path])
+    assert report.problems == []
+    assert {
+        (name, index) for name, camera in report.cameras.items() for index in camera.lost_indices
+    } == {
+        ("left/cam0", 0), ("left/cam0", 5), ("left/cam0", 6), ("left/cam1", 24), ("left/cam1", 7), ("left/cam1", 8),
+        ("right/cam0", 9),
+    }  # fmt: skip
+    for (camera, index), pixels in frames_of(tmp_path / "ssd_left/test").items():
+        assert pixels == pixels_of(camera, index).tobytes()
+
+
+def test_losses_of_one_side_are_on_the_other_disk_too(write_config, rig, tmp_path):
+    rig.missed = {("left_cam0", 3)}
+    record(write_config())
+    report = inspect([tmp_path / "ssd_right"])
+    assert set(report.cameras["left/cam0"].lost_indices) == {3}
+
+
+def test_an_unplugged_camera_leaves_the_others_without_a_gap(write_config, rig, tmp_path):
+    rig.unplugged_at = {"right_cam1": 10}
+    result = record(write_config())
+    accounts = {"/".join(place): (account.recorded, account.lost_total) for place, account in result.accounts.items()}
+    assert accounts.pop("right/cam1") == (10, TRIGGERS - 10)
+    assert set(accounts.values()) == {(TRIGGERS, 0)}
+    assert "right/cam1" in result.failures[0]
+    assert inspect([tmp_path]).problems == []
+
+
+def test_silent_and_garbled_pulses_do_not_move_the_numbering(write_config, rig, tmp_path, pixels_of):
+    rig.silent_pulses = {6}
+    rig.garbled_pulses = {12}
+    result = record(write_config(rate_hz=50))
+    assert (result.recorded, result.lost) == (4 * TRIGGERS, 0)
+    for (camera, index), pixels in frames_of(tmp_path / "ssd_left/test").items():
+        assert pixels == pixels_of(camera, index).tobytes()
+    assert inspect([tmp_path]).problems == ["2 triggers have no /trigger message: lines from the board were lost"]
+
+
+def test_segments_rotate_without_a_lost_frame(write_config, rig, tmp_path):
+    result = record(write_config(disks="segment_mb = 0.1"))
+    assert result.lost == 0
+    assert len(list((tmp_path / "ssd_left/test").glob("left_*.mcap"))) > 3
+    assert inspect([tmp_path]).problems == []
+
+
+def test_a_full_disk_ends_its_side_only(write_config, rig, tmp_path, monkeypatch):
+    real = __import__("os").statvfs
+
+    def statvfs(path):
+        found = real(path)
+        if "ssd_left" not in str(path):
+            return found
+        return type("Space", (), {"f_bavail": 0, "f_frsize": found.f_frsize})
+
+    monkeypatch.setattr("capture.recorder.os.statvfs", statvfs)
+    result = record(write_config())
+    lost = {"/".join(place): account.lost for place, account in result.accounts.items()}
+    assert lost["left/cam0"] == {"disk": TRIGGERS}
+    assert lost["right/cam0"] == lost["right/cam1"] == {}
+    assert "free" in result.failures[0]
+
+
+@pytest.mark.parametrize("write", ["auto", "buffered"])
+def test_rosbags_opens_the_flight_folder(write_config, rig, tmp_path, pixels_of, write):
+    record(write_config(disks=f'write = "{write}"'), triggers=5)
+    with AnyReader([tmp_path / "ssd_right/test"]) as reader:
+        topics = {connection.topic for connection in reader.connections}
+        assert {"/right/cam0/image_raw", "/right/cam1/frame", "/trigger", "/diagnostics"} <= topics
+        images = [connection for connection in reader.connections if connection.topic == "/right/cam0/image_raw"]
+        seen = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(connections=images)]
+    assert len(seen) == 5
+    for index, image in enumerate(seen):
+        assert np.array_equal(image.data, pixels_of("right_cam0", index))
+
+
+def test_a_flight_is_never_written_over(write_config, rig):
+    config = write_config()
+    record(config, triggers=3)
+    with pytest.raises(UsageError, match="exists already"):
+        record(config, triggers=3)
+
+
+def test_a_swapped_camera_is_refused(write_config, rig):
+    config = write_config()
+    config.write_text(config.read_text().replace('address = "left_cam0"', 'address = "left_cam0"\nserial = "other"'))
+    with pytest.raises(CameraError, match="left/cam0: serial serial-left_cam0 answers"):
+        record(config)
+
+
+def test_a_missing_board_is_one_line(write_config, rig):
+    config = write_config()
+    config.write_text(config.read_text().replace(rig.port, "/dev/no-such-port"))
+    with pytest.raises(TriggerBoardError, match="/dev/no-such-port"):
+        record(config)
