@@ -5,7 +5,6 @@ import os
 import sys
 from typing import Any, NoReturn
 
-import click
 import typer
 
 from capture.errors import WingshapeError
@@ -17,13 +16,10 @@ def run(app: typer.Typer) -> NoReturn:
     Exit codes: 0 done; 1 a failure (``WingshapeError``, or the system refused a file); 2 wrong usage;
     130 interrupted. Set ``WINGSHAPE_DEBUG=1`` to see the traceback behind an error line.
     """
+    app.pretty_exceptions_enable = False
     try:
-        code = app(standalone_mode=False)
-    except click.exceptions.Exit as stop:
-        sys.exit(stop.exit_code)
-    except click.ClickException as error:
-        _fail(error.format_message(), 2)
-    except (click.Abort, KeyboardInterrupt):
+        app()  # Typer itself reports wrong usage, with exit code 2
+    except KeyboardInterrupt:
         _fail("interrupted", 130)
     except WingshapeError as error:
         _fail(str(error), error.exit_code)
@@ -33,7 +29,7 @@ def run(app: typer.Typer) -> NoReturn:
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         _fail(f"{place}{error.strerror or error}", 1)
-    sys.exit(code if isinstance(code, int) else 0)
+    sys.exit(0)
 
 
 def _fail(message: str, code: int) -> NoReturn:

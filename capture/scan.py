@@ -1,5 +1,6 @@
 """One MCAP file to its chunks and messages, record by record, up to where it is whole; what is wrong is listed."""
 
+import io
 import mmap
 import struct
 import zlib
@@ -9,16 +10,18 @@ from pathlib import Path
 
 from mcap import records
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from capture.errors import RecordingError
 from capture.record import PROVENANCE
-from capture.segment import MAGIC
+from capture.segment import GUARD, GUARD_OPCODE, MAGIC, PADDING_OPCODE
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQIIQ")
 FOOTER_BYTES = 9 + 20 + len(MAGIC)
+_FOOTER_HEAD = _RECORD.pack(Opcode.FOOTER, 20)
 
 
 @dataclass(frozen=True)
@@ -66,17 +69,50 @@ def scan(path: Path) -> tuple[Scan, Iterator[ScannedMessage]]:
 
 def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
     at = len(MAGIC)
+    open_from: int | None = 0  # first byte of the records outside chunks that no guard has covered yet
+    index: dict[int, list[tuple[int, int]]] = {}
     while at + _RECORD.size <= found.size:
         opcode, length = _RECORD.unpack_from(data, at)
-        body_at, end = at + _RECORD.size, at + _RECORD.size + length
+        end = at + _RECORD.size + length
         if opcode == 0 or end > found.size:
             break
-        body = data[body_at:end]
+        body = data[at + _RECORD.size : end]
+        if opcode in (Opcode.CHUNK, Opcode.DATA_END):
+            _demand(found, at, open_from is None, "records before this that no checksum covers")
+            open_from = None
         if opcode == Opcode.CHUNK:
-            yield from _chunk(found, body, at)
-        elif opcode == Opcode.MESSAGE:
-            found.problems.append(f"byte {at}: a message outside a chunk, which no index knows of")
-        elif opcode == Opcode.METADATA:
+            index = {}
+            yield from _chunk(found, body, at, index)
+        elif opcode == Opcode.MESSAGE_INDEX:
+            _check_index(found, body, at, index)
+        elif opcode == PADDING_OPCODE:
+            _demand(found, at, not any(body), "padding that is not empty")
+        elif opcode == GUARD_OPCODE:
+            covered_from, crc = GUARD.unpack(body) if length == GUARD.size else (None, 0)
+            good = covered_from == open_from and covered_from is not None and zlib.crc32(data[covered_from:at]) == crc
+            _demand(found, at, good, "header, channels or metadata that differ from their CRC")
+            open_from = None
+        elif opcode == Opcode.DATA_END:
+            _demand(found, at, body == bytes(4), "a closing record that was altered")
+            found.closed = _check_summary(found, data, end)
+            return
+        else:
+            open_from = at if open_from is None else open_from
+            _take_record(found, opcode, body, at)
+        at = end
+    found.problems.append(
+        f"ends at byte {at} of {found.size} without its closing records: it was not closed, or was cut"
+    )
+
+
+def _demand(found: Scan, at: int, fulfilled: bool, otherwise: str) -> None:
+    if not fulfilled:
+        found.problems.append(f"byte {at}: {otherwise}")
+
+
+def _take_record(found: Scan, opcode: int, body: memoryview, at: int) -> None:
+    try:
+        if opcode == Opcode.METADATA:
             record = records.Metadata.read(_stream(body))
             found.metadata[record.name] = record.metadata
             if record.name == PROVENANCE:
@@ -84,20 +120,18 @@ def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
         elif opcode == Opcode.CHANNEL:
             channel = records.Channel.read(_stream(body))
             found.topics[channel.id] = channel.topic
-        elif opcode == Opcode.DATA_END:
-            found.closed = _check_summary(found, data, end)
-            return
-        at = end
-    found.problems.append(
-        f"ends at byte {at} of {found.size} without its closing records: it was not closed, or was cut"
-    )
+        elif opcode not in (Opcode.HEADER, Opcode.SCHEMA, Opcode.ATTACHMENT):
+            found.problems.append(f"byte {at}: a record of kind {opcode:#x} that does not belong here")
+    except (McapError, ValueError, struct.error) as error:
+        found.problems.append(f"byte {at}: a record that cannot be read ({error})")
 
 
-def _chunk(found: Scan, body: memoryview, at: int) -> Iterator[ScannedMessage]:
+def _chunk(found: Scan, body: memoryview, at: int, index: dict[int, list[tuple[int, int]]]) -> Iterator[ScannedMessage]:
+    """The messages of a chunk; ``index`` is filled with what its MessageIndex records must say."""
     if len(body) < _CHUNK.size:
         found.problems.append(f"byte {at}: a chunk too short for its own header")
         return
-    _, _, size, crc, compression, stored = _CHUNK.unpack_from(body)
+    first_ns, last_ns, size, crc, compression, stored = _CHUNK.unpack_from(body)
     content = body[_CHUNK.size :]
     if compression or size != stored or len(content) != size:
         found.problems.append(f"byte {at}: a chunk whose lengths do not agree")
@@ -112,6 +146,7 @@ def _chunk(found: Scan, body: memoryview, at: int) -> Iterator[ScannedMessage]:
         start = inner + _RECORD.size
         if opcode == Opcode.MESSAGE:
             channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content, start)
+            index.setdefault(channel, []).append((log_ns, inner))
             yield ScannedMessage(
                 found.topics.get(channel, f"channel {channel}"),
                 sequence,
@@ -120,6 +155,16 @@ def _chunk(found: Scan, body: memoryview, at: int) -> Iterator[ScannedMessage]:
                 content[start + _MESSAGE.size : start + length],
             )
         inner = start + length
+    times = [log_ns for entries in index.values() for log_ns, _ in entries]
+    _demand(found, at, (min(times), max(times)) == (first_ns, last_ns), "a chunk whose header has the wrong times")
+
+
+def _check_index(found: Scan, body: memoryview, at: int, index: dict[int, list[tuple[int, int]]]) -> None:
+    count = max(0, len(body) - 6) // 16
+    channel, size = struct.unpack_from("<HI", body) if len(body) >= 6 else (0, 0)
+    entries = [struct.unpack_from("<QQ", body, 6 + 16 * k) for k in range(count)]
+    good = size == 16 * count and len(body) == 6 + size and entries == index.get(channel)
+    _demand(found, at, good, "a message index that does not agree with its chunk")
 
 
 def _check_summary(found: Scan, data: memoryview, at: int) -> bool:
@@ -128,8 +173,8 @@ def _check_summary(found: Scan, data: memoryview, at: int) -> bool:
     if footer_at < at or bytes(data[found.size - len(MAGIC) :]) != MAGIC:
         found.problems.append(f"byte {at}: the summary is cut short")
         return False
-    _, summary_at, _, crc = struct.unpack_from("<9sQQI", data, footer_at)
-    if summary_at != at or zlib.crc32(data[at : footer_at + 25]) != crc:
+    head, summary_at, _, crc = struct.unpack_from("<9sQQI", data, footer_at)
+    if summary_at != at or zlib.crc32(data[at : footer_at + 25]) != crc or bytes(head) != _FOOTER_HEAD:
         found.problems.append(f"byte {at}: the summary differs from its CRC")
         return False
     indexed = sum(1 for opcode in _opcodes(data, at, footer_at) if opcode == Opcode.CHUNK_INDEX)
@@ -147,6 +192,4 @@ def _opcodes(data: memoryview, at: int, end: int) -> Iterator[int]:
 
 
 def _stream(body: memoryview) -> ReadDataStream:
-    import io
-
     return ReadDataStream(io.BytesIO(bytes(body)))

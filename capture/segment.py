@@ -7,6 +7,9 @@ Layout of a frame's slot, which is what goes to disk, byte for byte (p = start o
     p    pixels
          Message of the Frame · [end of chunk] · two MessageIndex records · private record 0x80 up to the page's end
 
+What lies outside chunks (header, schemas, channels, provenance) is followed by a private record 0x81: offset of the
+first byte it covers and their CRC. So every byte of a closed file is checked by ``wingcap verify``.
+
 Readers skip private records (MCAP specification, opcodes 0x80–0xFF); offsets, lengths and addresses of every write are
 multiples of the page size, as O_DIRECT wants.
 """
@@ -30,7 +33,9 @@ from capture.ring import PAGE
 
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "wingshape"
-_PADDING_OPCODE = 0x80
+PADDING_OPCODE = 0x80
+GUARD_OPCODE = 0x81
+GUARD = struct.Struct("<QI")
 _RECORD = struct.Struct("<BQ")
 _CHUNK_FIELDS = struct.Struct("<QQQIIQ")  # start, end, size, crc, length of "" (no compression), size
 _MESSAGE_FIELDS = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -225,7 +230,7 @@ class SegmentWriter:
         records.Metadata(name=name, metadata=values).write(out)
         block = out.end()
         self._metadata_indexes.append(records.MetadataIndex(self.bytes_written, len(block), name))
-        self._write_block(block)
+        self._write_block(block + self._guard(block))
 
     def attach(self, path: Path, log_ns: int) -> None:
         """Carry a small file along (a calibration)."""
@@ -246,7 +251,7 @@ class SegmentWriter:
                 media_type="application/json",
             )
         )
-        self._write_block(block)
+        self._write_block(block + self._guard(block))
 
     def sync(self) -> None:
         """Wait until what was written is on the disk."""
@@ -301,7 +306,11 @@ class SegmentWriter:
         records.Metadata(name=PROVENANCE, metadata=provenance).write(out)
         self._metadata_indexes.append(records.MetadataIndex(start, len(MAGIC) + out.count - start, PROVENANCE))
         self._put_schemas_and_channels(out)
-        self._write_block(MAGIC + out.end())
+        block = MAGIC + out.end()
+        self._write_block(block + self._guard(block))
+
+    def _guard(self, block: bytes) -> bytes:
+        return _RECORD.pack(GUARD_OPCODE, GUARD.size) + GUARD.pack(self.bytes_written, zlib.crc32(block))
 
     def _put_schemas_and_channels(self, out: RecordBuilder) -> None:
         for name, number in self._schema_ids.items():
@@ -408,7 +417,7 @@ def _put_message(slot: memoryview, at: int, length: int, channel: int, sequence:
 
 def _pad(view: memoryview, at: int, end: int) -> None:
     """Fill [at, end) with one private record. There must be room for its 9 bytes."""
-    _RECORD.pack_into(view, at, _PADDING_OPCODE, end - at - _RECORD.size)
+    _RECORD.pack_into(view, at, PADDING_OPCODE, end - at - _RECORD.size)
 
 
 def _round_up(value: int, multiple: int) -> int:

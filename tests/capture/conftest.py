@@ -3,6 +3,7 @@
 import contextlib
 import os
 import queue
+import subprocess
 import sys
 import threading
 import time
@@ -218,3 +219,14 @@ def write_config(tmp_path: Path, rig: FakeRig) -> Callable[..., Path]:
 @pytest.fixture(name="pixels_of")
 def _pixels_of() -> Callable[[str, int], np.ndarray]:
     return pixels_of
+
+
+@pytest.fixture
+def wingcap() -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs the command as a user would."""
+
+    def call(*words: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-c", "from capture.cli import main; main()", *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+    return call

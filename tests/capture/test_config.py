@@ -1,0 +1,49 @@
+"""A configuration that cannot be used is refused in one line that names the file and the key."""
+
+import pytest
+
+from capture.config import load_config
+from capture.errors import ConfigError
+
+
+def test_defaults_and_relative_paths(write_config, tmp_path):
+    config = load_config(write_config(rate_hz=25)).config
+    assert config.disks.left == tmp_path / "ssd_left"
+    assert config.ring_slots == 13 + 6  # 0.5 s of stall at 25 Hz, and what the driver holds
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("[ring]", "[ring]\ncolour = 3", "unknown key `ring.colour`"),
+        ("rate_hz = 100.0", "rate_hz = -1", "`trigger.rate_hz`"),
+        ("rate_hz = 100.0", "", ""),
+        ('backend = "fake"', 'backend = "film"', "backend 'film' is unknown"),
+        ('backend = "fake"', "", "key `camera.backend` is missing"),
+        ('side = "right"', 'side = "left"', "named twice"),
+        ("[trigger]", "[trigger", "not a TOML file"),
+        ('flight = "test"', 'flight = "../up"', "`flight`"),
+        ('flight = "test"', 'calibration = "rig.json"', "the calibration named in"),
+    ],
+)
+def test_refusals(write_config, wingcap, old, new, says):
+    path = write_config()
+    path.write_text(path.read_text().replace(old, new))
+    if not says:
+        assert load_config(path).config.trigger.rate_hz == 25.0
+        return
+    with pytest.raises(ConfigError) as refusal:
+        load_config(path)
+    assert str(path) in str(refusal.value)
+    assert says in str(refusal.value)
+    answer = wingcap("record", "--config", path)
+    assert (answer.returncode, answer.stderr.count("\n")) == (2, 1)
+
+
+def test_a_missing_file(tmp_path, wingcap):
+    answer = wingcap("record", "--config", tmp_path / "none.toml")
+    assert answer.returncode == 2
+    assert answer.stderr.startswith(f"error: {tmp_path}/none.toml: cannot be read (No such file or directory)")
+    assert answer.stderr.count("\n") == 1
+    assert wingcap("record").returncode == 2
+    assert wingcap("nonsense").returncode == 2
