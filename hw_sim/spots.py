@@ -1,0 +1,173 @@
+"""The wing's lights at an instant, to spots in one camera's image: place, size, brightness, halo and reflections.
+
+A light is a disc that faces the camera (its dome looks round from everywhere). Its image is the disc's affine
+projection; the difference between a disc's centre and its image's centre (perspective; under 0.02 px at the nearest
+pair) is left out, so that ``centre_px`` is exactly the projected centre. Each spot stands where the wing was in the
+exposure of the spot's own row.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw_sim import optics
+from hw_sim.wing_motion import LedMotion
+from hw_sim.world import CameraTruth, World
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+_BLUR_NODES, _BLUR_WEIGHTS = np.polynomial.legendre.leggauss(3)  # instants of the exposure that make the motion blur
+_FINISHES = {"matt": (0.015, 0.0015), "clean": (0.30, 0.0002)}  # part mirrored, one sigma of its spread on the wing (m)
+
+
+@dataclass(frozen=True)
+class Spots:
+    """n spots of light in one image."""
+
+    centre_px: Array  # (n, 2) at mid-exposure of the spot's row
+    path_px: Array  # (n, 3, 2) at the Gauss–Legendre instants of the exposure
+    inverse: Array  # (n, 2, 2) pixels off the centre to disc radii
+    radius_px: Array  # (n,) √|det|: the mean one
+    sigma_px: Array  # (n,) of the Gaussian that the disc is convolved with, the pixel included
+    peak_e: Array  # (n,) electrons of a pixel well inside a large disc
+
+    def __len__(self) -> int:
+        return len(self.peak_e)
+
+
+BLUR_WEIGHTS: Array = _BLUR_WEIGHTS / 2.0
+"""(3,) weights of ``Spots.path_px``; they add up to one."""
+
+
+def row_times_ns(camera: CameraTruth, start_ns: int, exposure_us: int, rows_px: Array) -> Times:
+    """Mid-exposure, UTC, of rows: row r starts ``r · row_time`` after row 0 at ``start_ns``."""
+    after_us = rows_px * camera.row_time_us + exposure_us / 2.0
+    times: Times = start_ns + np.rint(after_us * 1000.0).astype(np.int64)
+    return times
+
+
+def led_spots(
+    world: World, camera: CameraTruth, leds: LedMotion, start_ns: int, exposure_us: int, gain_db: float = 0.0
+) -> Spots:
+    """Spots of the wing's lights, then of their reflections, in the frame whose row 0 opens at ``start_ns`` (UTC).
+
+    The wing's place and the row it is seen in depend on each other; iterating from the middle row gains a factor of
+    over 100 a step at the wing's speeds, so four steps are exact to 1e-6 px.
+    """
+    rows = np.full(len(leds), world.sensor.height_px / 2.0)
+    for _ in range(4):
+        centres, frames = leds.centres(row_times_ns(camera, start_ns, exposure_us, rows))
+        rows = optics.project(camera, centres)[:, 1]
+    middle = row_times_ns(camera, start_ns, exposure_us, rows)
+    off_ns = np.rint(_BLUR_NODES * exposure_us * 500.0).astype(np.int64)
+    moved, _ = leds.centres(middle + off_ns[:, None])
+    beams, e3 = leds.beams(frames), frames[:, :, 2]
+    direct = facing_spots(world, camera, centres, beams, exposure_us, gain_db)
+    direct = _with_path(direct, optics.project(camera, moved).transpose(1, 0, 2))
+    part, spread_m = _FINISHES[world.scene.finish]
+    depth = 2.0 * world.leds.height_m * e3
+    mirrored_beams = beams - 2.0 * e3 * np.sum(beams * e3, axis=1, keepdims=True)
+    mirror = facing_spots(world, camera, centres - depth, mirrored_beams, exposure_us, gain_db, part, spread_m)
+    mirror = _with_path(mirror, optics.project(camera, moved - depth).transpose(1, 0, 2))
+    return _visible(_join(direct, mirror), world)
+
+
+def facing_spots(
+    world: World,
+    camera: CameraTruth,
+    centres_m: Array,
+    beams: Array | None,
+    exposure_us: int,
+    gain_db: float = 0.0,
+    part: float = 1.0,
+    spread_m: float = 0.0,
+) -> Spots:
+    """Spots of lights at rest at ``centres_m`` (n, 3), body frame.
+
+    Args:
+        world: sizes, brightness and sensor.
+        camera: who looks.
+        centres_m: light centres.
+        beams: (n, 3) unit vectors that the lights shine along, or None when each shines straight at the camera.
+        exposure_us: exposure.
+        gain_db: makes a pixel's well fuller: brightness is given in electrons at 0 dB.
+        part: of the light that arrives.
+        spread_m: one sigma of a diffuse spread at the light's place.
+    """
+    sight = optics.position_m(camera) - centres_m
+    distance_m = np.linalg.norm(sight, axis=1)
+    sight = sight / distance_m[:, None]
+    across = np.cross(sight, np.array([0.0, 0.0, 1.0]))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    upward = np.cross(across, sight)
+    radius_m = world.leds.diameter_m / 2.0
+    steps = np.stack([across, -across, upward, -upward]) * radius_m
+    ends = optics.project(camera, centres_m + steps)
+    axes: Array = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1) / 2.0
+    radius_px = np.sqrt(np.abs(np.linalg.det(axes)))
+    spread_px = spread_m / radius_m * radius_px
+    psf = world.sensor.psf_sigma_px
+    facing = np.ones(len(centres_m)) if beams is None else np.clip(np.sum(beams * sight, axis=1), 0.0, None)
+    brightness = world.leds.radiance_e_per_ms * exposure_us / 1000.0 * 10.0 ** (gain_db / 20.0)
+    centre = optics.project(camera, centres_m)
+    return Spots(
+        centre_px=centre,
+        path_px=np.repeat(centre[:, None], 3, axis=1),
+        inverse=np.linalg.inv(axes).astype(np.float64),
+        radius_px=radius_px,
+        sigma_px=np.sqrt(psf**2 + 1.0 / 12.0 + spread_px**2),
+        peak_e=part * brightness * facing**world.leds.beam_exponent,
+    )
+
+
+def central_e(spots: Spots) -> Array:
+    """Electrons (n,) at the centre of each spot: a disc of radius a under a Gaussian reaches 1 − exp(−a²/2σ²)."""
+    central: Array = -spots.peak_e * np.expm1(-0.5 * (spots.radius_px / spots.sigma_px) ** 2)
+    return central
+
+
+def _visible(spots: Spots, world: World) -> Spots:
+    """Without those that are off the image, behind the camera or too faint to change a grey value."""
+    size = np.array([world.sensor.width_px, world.sensor.height_px])
+    inside = np.all((spots.centre_px > -20.0) & (spots.centre_px < size + 19.0), axis=1)
+    keep = inside & (central_e(spots) > 0.1 * world.sensor.e_per_dn)
+    if keep.all():
+        return spots
+    return Spots(*(getattr(spots, name)[keep] for name in Spots.__dataclass_fields__))
+
+
+def _with_path(spots: Spots, path_px: Array) -> Spots:
+    return Spots(spots.centre_px, path_px, spots.inverse, spots.radius_px, spots.sigma_px, spots.peak_e)
+
+
+def _join(first: Spots, second: Spots) -> Spots:
+    return Spots(*(np.concatenate([getattr(first, n), getattr(second, n)]) for n in Spots.__dataclass_fields__))
+
+
+def patch_half_px(spots: Spots, world: World) -> NDArray[np.int64]:
+    """Half width (n,) of the square that holds each spot, its motion and, when overexposed, its halo."""
+    swept = np.max(np.abs(spots.path_px - spots.centre_px[:, None]), axis=(1, 2))
+    half = np.ceil(spots.radius_px * 1.3 + 3.8 * spots.sigma_px + swept) + 1
+    halo = halo_e(spots, world)
+    over = halo > 0.0
+    if over.any():
+        reach = spots.radius_px + halo_length_px(spots, world) * np.log(
+            np.maximum(4.0 * halo, 1.0) / world.sensor.e_per_dn
+        )
+        half = np.where(over, np.minimum(np.maximum(half, np.ceil(reach)), 120), half)
+    whole: NDArray[np.int64] = half.astype(np.int64)
+    return whole
+
+
+def halo_e(spots: Spots, world: World) -> Array:
+    """Electrons (n,) of the veil at the disc's edge: a part of what exceeds the full well; 0 for a unsaturated spot."""
+    veil: Array = world.sensor.veil * np.maximum(central_e(spots) - world.sensor.full_well_e, 0.0)
+    return veil
+
+
+def halo_length_px(spots: Spots, world: World) -> Array:
+    """Length (n,) over which the veil falls to 1/e: it grows with the logarithm of the overexposure."""
+    over = np.maximum(central_e(spots) / world.sensor.full_well_e, 1.0)
+    return (2.0 + spots.radius_px) * (1.0 + np.log(over))
