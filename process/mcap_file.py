@@ -1,0 +1,270 @@
+"""MCAP files to the places of their messages, and to the messages themselves: one read a chunk, CRC verified.
+
+Only what is needed to read a recording fast: the summary comes from the ``mcap`` library, the chunks are walked
+here by hopping from record to record, so that indexing never touches a pixel.
+Format: https://mcap.dev/spec (records and opcodes), version 0.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import get_chunk_data_stream
+
+MAGIC = b"\x89MCAP0\r\n"
+CHANNEL, MESSAGE, CHUNK, DATA_END = 0x04, 0x05, 0x06, 0x0F
+
+_HEAD = struct.Struct("<BQ")  # opcode and length of every record
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
+_LONGEST_HEAD = 4096  # bytes read to learn a record's head; a channel record fits, too
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a message's data lies: ``size`` bytes at ``at`` in the uncompressed records of a chunk of a file."""
+
+    path: str
+    chunk_at: int
+    chunk_size: int
+    at: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class MessageHead:
+    """A message without its data."""
+
+    topic: str
+    sequence: int
+    publish_time_ns: int
+    place: Place
+
+
+@dataclass
+class FileIndex:
+    """The messages of one file, in file order, and what is wrong with the file."""
+
+    messages: list[MessageHead] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class _ChunkHead:
+    uncompressed_size: int
+    crc: int
+    compression: str
+    records_at: int  # from the start of the chunk record
+    records_size: int
+
+
+class BadChunk(ValueError):
+    """A chunk whose bytes are not what was written."""
+
+
+def index_file(path: Path) -> FileIndex:
+    """Every message of ``path``. A file that ends early is read up to its last complete chunk; nothing is raised."""
+    index = FileIndex()
+    channels: dict[int, str] = {}
+    try:
+        with _Descriptor(path) as descriptor:
+            chunks = _chunks_of_summary(path, channels)
+            if chunks is None:
+                chunks = _chunks_by_scanning(path, descriptor, index.problems)
+            for at, size in chunks:
+                try:
+                    index.messages.extend(_messages_of_chunk(str(path), descriptor, at, size, channels))
+                except (BadChunk, McapError) as error:
+                    index.problems.append(f"{path}: chunk at byte {at} is not readable ({error})")
+    except OSError as error:
+        index.problems.append(f"{path}: {error.strerror or error}")
+    return index
+
+
+class ChunkReader:
+    """Reads messages; keeps the last chunk, and the files open. Each thread or process needs its own.
+
+    With ``reuse`` the bytes of a chunk go into one buffer for the reader's whole life, so that what was read before
+    is overwritten by the next chunk: saves the kernel from clearing 3 MB a frame.
+    """
+
+    def __init__(self, *, reuse: bool = False) -> None:
+        self._reuse = reuse
+        self._buffer = bytearray()
+        self._descriptors: dict[str, int] = {}
+        self._last: tuple[str, int] | None = None
+        self._records = memoryview(b"")
+
+    def read(self, place: Place) -> memoryview:
+        """The message's data. Raises ``BadChunk`` if the chunk fails its CRC or is cut, ``OSError`` from the disk."""
+        if self._last != (place.path, place.chunk_at):
+            self._last = None
+            self._records = self._read_chunk(place)
+            self._last = (place.path, place.chunk_at)
+        return self._records[place.at : place.at + place.size]
+
+    def close(self) -> None:
+        """Close the files; memory handed out stays valid."""
+        for descriptor in self._descriptors.values():
+            os.close(descriptor)
+        self._descriptors.clear()
+
+    def _read_chunk(self, place: Place) -> memoryview:
+        descriptor = self._descriptors.get(place.path)
+        if descriptor is None:
+            while len(self._descriptors) >= 8:  # segments are read in order: the oldest is done with
+                os.close(self._descriptors.pop(next(iter(self._descriptors))))
+            descriptor = self._descriptors[place.path] = os.open(place.path, os.O_RDONLY)
+        if not self._reuse or len(self._buffer) < place.chunk_size:
+            self._records = memoryview(b"")
+            self._buffer = bytearray(place.chunk_size)
+        chunk = memoryview(self._buffer)[: place.chunk_size]
+        _read_fully(descriptor, chunk, place.chunk_at)
+        return _records_of_chunk(chunk)
+
+
+def _chunks_of_summary(path: Path, channels: dict[int, str]) -> list[tuple[int, int]] | None:
+    """(offset, size) of the chunks by the summary, ``channels`` filled; None if the file has no usable summary."""
+    try:
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+    except (McapError, struct.error, ValueError, OverflowError, MemoryError, EOFError, OSError):
+        return None  # whatever a cut or overwritten end makes of it
+    if summary is None or (not summary.chunk_indexes and summary.statistics is None):
+        return None
+    channels.update({identity: channel.topic for identity, channel in summary.channels.items()})
+    chunks = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in summary.chunk_indexes]
+    return sorted(chunks)
+
+
+def _chunks_by_scanning(path: Path, descriptor: int, problems: list[str]) -> list[tuple[int, int]]:
+    """(offset, size) of the complete chunks of a file without summary; says in ``problems`` what is wrong with it."""
+    end = os.fstat(descriptor).st_size
+    if os.pread(descriptor, len(MAGIC), 0) != MAGIC:
+        problems.append(f"{path}: not an MCAP file")
+        return []
+    chunks = []
+    at = len(MAGIC)
+    while at + _HEAD.size <= end:
+        opcode, length = _HEAD.unpack(os.pread(descriptor, _HEAD.size, at))
+        if opcode in (0, DATA_END) or at + _HEAD.size + length > end:
+            break
+        if opcode == CHUNK:
+            chunks.append((at, _HEAD.size + length))
+        at += _HEAD.size + length
+    problems.append(
+        f"{path}: no summary (the recording was cut); read up to byte {at} of {end}, {len(chunks)} chunks"
+        " (`wingcap recover` repairs it)"
+    )
+    return chunks
+
+
+def _messages_of_chunk(
+    path: str, descriptor: int, at: int, size: int, channels: dict[int, str]
+) -> Iterator[MessageHead]:
+    """Heads of a chunk's messages; channels that it declares are added to ``channels``."""
+    head = _chunk_head(os.pread(descriptor, 256, at), size)
+    if head.compression:
+        chunk = bytearray(size)
+        _read_fully(descriptor, memoryview(chunk), at)
+        records = _records_of_chunk(memoryview(chunk))
+        total = len(records)
+    else:
+        records = None
+        total = head.records_size
+    offset = 0
+    while offset + _HEAD.size <= total:
+        if records is None:
+            start = os.pread(descriptor, min(64, total - offset), at + head.records_at + offset)
+        else:
+            start = bytes(records[offset : offset + 64])
+        opcode, length = _HEAD.unpack_from(start)
+        if offset + _HEAD.size + length > total:
+            raise BadChunk("a record runs over its end")
+        if opcode == MESSAGE:
+            if length < _MESSAGE_HEAD.size:
+                raise BadChunk("a message without its head")
+            channel, sequence, _, publish_time_ns = _MESSAGE_HEAD.unpack_from(start, _HEAD.size)
+            if channel in channels:
+                data_at = offset + _HEAD.size + _MESSAGE_HEAD.size
+                place = Place(path, at, size, data_at, length - _MESSAGE_HEAD.size)
+                yield MessageHead(channels[channel], sequence, publish_time_ns, place)
+        elif opcode == CHANNEL:
+            wanted = min(_HEAD.size + length, _LONGEST_HEAD)
+            if records is None:
+                start = os.pread(descriptor, wanted, at + head.records_at + offset)
+            else:
+                start = bytes(records[offset : offset + wanted])
+            identity, _, name_size = struct.unpack_from("<HHI", start, _HEAD.size)
+            name_at = _HEAD.size + 8
+            channels[identity] = start[name_at : name_at + name_size].decode(errors="replace")
+        offset += _HEAD.size + length
+
+
+def _chunk_head(start: bytes | memoryview, size: int) -> _ChunkHead:
+    try:
+        opcode, length = _HEAD.unpack_from(start)
+        _, _, uncompressed_size, crc = _CHUNK_HEAD.unpack_from(start, _HEAD.size)
+        name_at = _HEAD.size + _CHUNK_HEAD.size
+        (name_size,) = struct.unpack_from("<I", start, name_at)
+        compression = bytes(start[name_at + 4 : name_at + 4 + name_size]).decode(errors="replace")
+        (records_size,) = struct.unpack_from("<Q", start, name_at + 4 + name_size)
+    except struct.error as error:
+        raise BadChunk("its head is cut") from error
+    records_at = name_at + 4 + name_size + 8
+    if opcode != CHUNK or _HEAD.size + length != size or records_at + records_size > size:
+        raise BadChunk("its head does not match the file's index")
+    return _ChunkHead(uncompressed_size, crc, compression, records_at, records_size)
+
+
+def _records_of_chunk(chunk: memoryview) -> memoryview:
+    """The uncompressed records of a chunk record's bytes, verified."""
+    head = _chunk_head(chunk, len(chunk))
+    records = chunk[head.records_at : head.records_at + head.records_size]
+    if head.compression:
+        records = memoryview(_decompress(head, bytes(records)))
+    if head.crc and zlib.crc32(records) != head.crc:
+        raise BadChunk("its CRC does not match")
+    return records
+
+
+def _decompress(head: _ChunkHead, data: bytes) -> bytes:
+    if head.compression not in ("lz4", "zstd"):
+        raise BadChunk(f"unknown compression {head.compression!r}")
+    record: Any = Chunk(head.compression, data, 0, 0, 0, head.uncompressed_size)
+    try:
+        stream, size = get_chunk_data_stream(record)
+        return bytes(stream.read(size))
+    except Exception as error:  # the two compression libraries share no error class
+        raise BadChunk(f"{head.compression}: {error}") from error
+
+
+def _read_fully(descriptor: int, buffer: memoryview, at: int) -> None:
+    done = 0
+    while done < len(buffer):
+        count = os.preadv(descriptor, [buffer[done:]], at + done)
+        if count == 0:
+            raise BadChunk("the file ends within it")
+        done += count
+
+
+class _Descriptor:
+    """A file descriptor closed at the end of its ``with``."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._descriptor = -1
+
+    def __enter__(self) -> int:
+        self._descriptor = os.open(self._path, os.O_RDONLY)
+        return self._descriptor
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._descriptor)
