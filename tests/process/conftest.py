@@ -41,8 +41,9 @@ class SpotPainter:
             _integrated(rows[:, None] - v - points[:, 1], blur)
             @ _integrated(columns[:, None] - u - points[:, 0], blur).T
         )
-        kept = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        self.clean[kept] += light * (amplitude / light.max())
+        inside = np.ix_((rows >= 0) & (rows < len(self.clean)), (columns >= 0) & (columns < self.clean.shape[1]))
+        place = np.ix_(rows[inside[0].ravel()], columns[inside[1].ravel()])
+        self.clean[place] += light[inside] * (amplitude / light.max())
 
     def image(self, background: float = 8.0, read_sigma: float = 1.5, shot_gain: float = 0.04) -> NDArray[np.uint8]:
         """The picture with shot noise, read noise, quantisation and clipping."""
