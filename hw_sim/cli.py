@@ -1,5 +1,7 @@
 """``wingsim``: worlds, calibration sessions, the rig that stands in for the hardware, truth and the demonstration."""
 
+import signal
+import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -7,7 +9,9 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from capture.console import run, say
+from capture.clock import SystemClock
+from capture.console import note, run, say
+from capture.errors import UsageError
 from hw_sim.demo import demo
 from hw_sim.world import World
 
@@ -50,6 +54,61 @@ def sessions(
         task = bar.add_task("images", total=None)
         count = write_sessions(known, out, workers, lambda done, total: bar.update(task, completed=done, total=total))
     say(f"{out}: {count} images and survey.toml")
+
+
+@app.command()
+def rig(
+    world: WorldOption,
+    socket: Annotated[Path, typer.Option(help="Unix socket to put the four cameras behind.")],
+    trigger_port: Annotated[
+        Path, typer.Option(help="Where the trigger board's serial port appears (a symbolic link).")
+    ],
+    truth: Annotated[Path | None, typer.Option(help="Folder for the truth of the flight, written at the end.")] = None,
+) -> None:
+    """Be the hardware, in real time, until SIGTERM or SIGINT. Says `ready` on standard output when usable.
+
+    At the end the truth from the first to the last trigger is written, 0.2 s more at both ends.
+    """
+    from hw_sim.rig import Rig
+    from hw_sim.truth import AROUND_NS, clear_truth, write_truth
+
+    known = World.read(world)
+    if truth is not None:
+        clear_truth(truth)
+    asked = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: asked.set())
+    hardware = Rig(known, socket, trigger_port, SystemClock())
+    try:
+        hardware.start()
+        say("ready")
+        while not asked.wait(0.2):
+            hardware.check()
+    finally:
+        hardware.close()
+    hardware.check()
+    for name, counts in hardware.counts().items():
+        note(f"{name}: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
+    pulses = hardware.pulses
+    if truth is not None and pulses:
+        write_truth(known, pulses[0].actual_ns - AROUND_NS, pulses[-1].actual_ns + AROUND_NS, truth, pulses)
+        note(f"{truth}: truth of {len(pulses)} triggers")
+
+
+@app.command()
+def truth(
+    world: WorldOption,
+    from_ns: Annotated[int, typer.Option("--from-ns", help="UTC nanoseconds.")],
+    to_ns: Annotated[int, typer.Option("--to-ns", help="UTC nanoseconds.")],
+    out: OutOption,
+) -> None:
+    """Write the true markers and shapes between two times."""
+    from hw_sim.truth import write_truth
+
+    if to_ns <= from_ns:
+        raise UsageError(f"--to-ns {to_ns} is not after --from-ns {from_ns}")
+    write_truth(World.read(world), from_ns, to_ns, out)
+    say(f"{out}: truth of {(to_ns - from_ns) * 1e-9:.3f} s")
 
 
 app.command("demo")(demo)

@@ -29,7 +29,7 @@ def render_frame(
 ) -> Pixels:
     """The whole image (height, width) of the frame whose row 0 opens at ``start_ns`` (UTC), all of it drawn afresh."""
     exposure = camera.exposure_us if exposure_us is None else exposure_us
-    spots = spot_model.led_spots(world, camera, LedMotion(world, camera.side), start_ns, exposure, gain_db)
+    spots = spot_model.led_spots(world, camera, LedMotion(world, camera.side), start_ns, exposure)
     return render_spots(world, spots, exposure, gain_db, np.random.default_rng([world.seed, seed]))
 
 
@@ -37,7 +37,7 @@ def render_spots(
     world: World, spots: Spots, exposure_us: int, gain_db: float, rng: np.random.Generator, frames: int = 1
 ) -> Pixels:
     """Image (height, width) of ``spots`` before the world's background; the rounded mean of ``frames`` images."""
-    light = background_e(world, exposure_us, gain_db)
+    light = background_e(world, exposure_us)
     patches = _Patches(world, spots)
     np.add.at(light.reshape(-1), patches.index, patches.light_e)
     if frames == 1:
@@ -49,31 +49,29 @@ def render_spots(
     return mean
 
 
-def background_e(world: World, exposure_us: int, gain_db: float = 0.0, margin_px: int = 0) -> Light:
+def background_e(world: World, exposure_us: int, margin_px: int = 0) -> Light:
     """Electrons (height + margin, width + margin) without the lights: none when dark, a smooth gradient in the sun."""
     shape = (world.sensor.height_px + margin_px, world.sensor.width_px + margin_px)
     if world.scene.background == "dark":
         return np.zeros(shape, dtype=np.float32)
     down, right = np.linspace(-1.0, 1.0, shape[0]), np.linspace(-1.0, 1.0, shape[1])
-    level = world.scene.sunlit_e_per_ms * exposure_us / 1000.0 * 10.0 ** (gain_db / 20.0)
+    level = world.scene.sunlit_e_per_ms * exposure_us / 1000.0
     sky = 1.0 - 0.25 * down[:, None] + 0.10 * right + 0.08 * np.sin(2.5 * right + 1.0) * np.cos(1.5 * down[:, None])
     light: Light = (level * sky).astype(np.float32)
     return light
 
 
 def expose(world: World, light_e: Light, gain_db: float, rng: np.random.Generator) -> Pixels:
-    """Grey values of expected electrons: full well, shot and read noise, black level, quantisation, 0 … 255.
+    """Grey values of expected electrons (0 dB): full well, shot and read noise, gain, black level, 0 … 255.
 
-    ``light_e`` is in electrons at 0 dB, that is times the gain: so is the read noise, while the shot noise's variance
-    grows with the gain. Shot noise is Gaussian of the Poisson's variance, which the read noise makes true enough.
+    The shot noise is Gaussian with the Poisson's variance; beside the read noise the difference does not show.
     """
-    gain = np.float32(10.0 ** (gain_db / 20.0))
     sensor = world.sensor
-    held = np.minimum(light_e, np.float32(sensor.full_well_e) * gain)
+    held = np.minimum(light_e, np.float32(sensor.full_well_e))
     noise = rng.standard_normal(light_e.shape, dtype=np.float32)
-    noise *= np.sqrt(gain * (held + gain * np.float32(sensor.read_noise_e**2)))
+    noise *= np.sqrt(held + np.float32(sensor.read_noise_e**2))
     held += noise
-    held *= np.float32(1.0 / sensor.e_per_dn)
+    held *= np.float32(10.0 ** (gain_db / 20.0) / sensor.e_per_dn)
     held += np.float32(sensor.black_dn + 0.5)
     return np.clip(held, 0.0, 255.0, out=held).astype(np.uint8)
 
@@ -88,7 +86,7 @@ class LiveRenderer:
         self._world, self._camera, self._noise = world, camera, noise
         self._exposure_us, self._gain_db = exposure_us, gain_db
         self._leds = LedMotion(world, camera.side)
-        self._background = background_e(world, exposure_us, gain_db)
+        self._background = background_e(world, exposure_us)
         self._light = self._background.copy()
         self._seed = [world.seed, *camera.key.encode()]
 
@@ -99,7 +97,7 @@ class LiveRenderer:
         height, width = out.shape
         frame, down, right = rng.integers(0, (_NOISE_FRAMES, _MARGIN_PX + 1, _MARGIN_PX + 1))
         np.copyto(out, self._noise[frame][down : down + height, right : right + width])
-        spots = spot_model.led_spots(world, self._camera, self._leds, start_ns, self._exposure_us, self._gain_db)
+        spots = spot_model.led_spots(world, self._camera, self._leds, start_ns, self._exposure_us)
         patches = _Patches(world, spots)
         light, flat = self._light.reshape(-1), out.reshape(-1)
         np.add.at(light, patches.index, patches.light_e)
@@ -113,7 +111,7 @@ def noise_frames(world: World, exposure_us: int, gain_db: float = 0.0) -> list[P
     Under a sunlit background the gradient moves with the random offset, by at most 64 pixels, as a sky does.
     """
     rng = np.random.default_rng([world.seed, 0xB6])
-    light = background_e(world, exposure_us, gain_db, _MARGIN_PX)
+    light = background_e(world, exposure_us, _MARGIN_PX)
     return [expose(world, light, gain_db, rng) for _ in range(_NOISE_FRAMES)]
 
 

@@ -48,28 +48,26 @@ def row_times_ns(camera: CameraTruth, start_ns: int, exposure_us: int, rows_px: 
     return times
 
 
-def led_spots(
-    world: World, camera: CameraTruth, leds: LedMotion, start_ns: int, exposure_us: int, gain_db: float = 0.0
-) -> Spots:
+def led_spots(world: World, camera: CameraTruth, leds: LedMotion, start_ns: int, exposure_us: int) -> Spots:
     """Spots of the wing's lights, then of their reflections, in the frame whose row 0 opens at ``start_ns`` (UTC).
 
-    The wing's place and the row it is seen in depend on each other; iterating from the middle row gains a factor of
-    over 100 a step at the wing's speeds, so four steps are exact to 1e-6 px.
+    The wing's place and the row it is seen in depend on each other; iterating from the middle row gains a factor of over
+    100 a step at the wing's speeds, so that the third is exact to 1e-5 px.
     """
     rows = np.full(len(leds), world.sensor.height_px / 2.0)
-    for _ in range(4):
-        centres, frames = leds.centres(row_times_ns(camera, start_ns, exposure_us, rows))
-        rows = optics.project(camera, centres)[:, 1]
+    for _ in range(3):
+        rows = optics.project(camera, leds.centres(row_times_ns(camera, start_ns, exposure_us, rows))[0])[:, 1]
     middle = row_times_ns(camera, start_ns, exposure_us, rows)
     off_ns = np.rint(_BLUR_NODES * exposure_us * 500.0).astype(np.int64)
-    moved, _ = leds.centres(middle + off_ns[:, None])
-    beams, e3 = leds.beams(frames), frames[:, :, 2]
-    direct = facing_spots(world, camera, centres, beams, exposure_us, gain_db)
+    moved, frames = leds.centres(middle + off_ns[:, None])
+    centres, frame = moved[1], frames[1]  # the middle node is mid-exposure
+    beams, e3 = leds.beams(frame), frame[:, :, 2]
+    direct = facing_spots(world, camera, centres, beams, exposure_us)
     direct = _with_path(direct, optics.project(camera, moved).transpose(1, 0, 2))
     part, spread_m = _FINISHES[world.scene.finish]
     depth = 2.0 * world.leds.height_m * e3
     mirrored_beams = beams - 2.0 * e3 * np.sum(beams * e3, axis=1, keepdims=True)
-    mirror = facing_spots(world, camera, centres - depth, mirrored_beams, exposure_us, gain_db, part, spread_m)
+    mirror = facing_spots(world, camera, centres - depth, mirrored_beams, exposure_us, part, spread_m)
     mirror = _with_path(mirror, optics.project(camera, moved - depth).transpose(1, 0, 2))
     return _visible(_join(direct, mirror), world)
 
@@ -80,7 +78,6 @@ def facing_spots(
     centres_m: Array,
     beams: Array | None,
     exposure_us: int,
-    gain_db: float = 0.0,
     part: float = 1.0,
     spread_m: float = 0.0,
 ) -> Spots:
@@ -92,7 +89,6 @@ def facing_spots(
         centres_m: light centres.
         beams: (n, 3) unit vectors that the lights shine along, or None when each shines straight at the camera.
         exposure_us: exposure.
-        gain_db: makes a pixel's well fuller: brightness is given in electrons at 0 dB.
         part: of the light that arrives.
         spread_m: one sigma of a diffuse spread at the light's place.
     """
@@ -110,7 +106,7 @@ def facing_spots(
     spread_px = spread_m / radius_m * radius_px
     psf = world.sensor.psf_sigma_px
     facing = np.ones(len(centres_m)) if beams is None else np.clip(np.sum(beams * sight, axis=1), 0.0, None)
-    brightness = world.leds.radiance_e_per_ms * exposure_us / 1000.0 * 10.0 ** (gain_db / 20.0)
+    brightness = world.leds.radiance_e_per_ms * exposure_us / 1000.0
     centre = optics.project(camera, centres_m)
     return Spots(
         centre_px=centre,
@@ -147,9 +143,10 @@ def _join(first: Spots, second: Spots) -> Spots:
 
 
 def patch_half_px(spots: Spots, world: World) -> NDArray[np.int64]:
-    """Half width (n,) of the square that holds each spot, its motion and, when overexposed, its halo."""
+    """Half width (n,) of the square that holds each spot down to 0.02 grey values, its motion and its halo."""
     swept = np.max(np.abs(spots.path_px - spots.centre_px[:, None]), axis=(1, 2))
-    half = np.ceil(spots.radius_px * 1.3 + 3.8 * spots.sigma_px + swept) + 1
+    tail = np.sqrt(2.0 * np.log(np.maximum(central_e(spots) / (0.02 * world.sensor.e_per_dn), 2.0)))
+    half = np.ceil(1.3 * spots.radius_px + tail * spots.sigma_px + swept)
     halo = halo_e(spots, world)
     over = halo > 0.0
     if over.any():
