@@ -13,7 +13,9 @@ from capture.clock import SystemClock
 from capture.config import load_config
 from capture.console import note, run, say, say_json
 from capture.daemon import Recording, RecordingResult, StopRule
+from capture.disk import SystemDisk
 from capture.errors import CaptureError
+from capture.recover import recover_flight
 from capture.verify import FlightReport, inspect
 
 app = typer.Typer(
@@ -36,7 +38,7 @@ def record(
     requested = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: requested.set())
-    recording = Recording(load_config(config), SystemClock(), note)
+    recording = Recording(load_config(config), SystemClock(), SystemDisk(), note)
     note(f"recording {recording.flight}")
     result = recording.run(StopRule(requested, triggers, duration))
     if json:
@@ -79,6 +81,29 @@ def verify(flight: FlightFolders, json: Json = False) -> None:
         )
 
 
+@app.command()
+def recover(
+    flight: FlightFolders,
+    out: Annotated[Path, typer.Option("--out", "-o", help="a new folder for the recovered copy")],
+    json: Json = False,
+) -> None:
+    """Give back every complete frame of a damaged or unfinished recording, as a copy that `wingcap verify` certifies.
+
+    The original is never touched. Exit code 0: nothing was missing. 3: partial. 1: nothing to give back.
+    """
+    result = recover_flight(flight, out)
+    if json:
+        say_json(result.as_dict())
+    else:
+        say(f"{result.frames} complete frames recovered into {out}, {result.missing} missing")
+        for problem in result.problems:
+            say(f"  {problem}")
+    if not result.frames:
+        raise CaptureError(f"{flight[0]}: no complete frame to give back")
+    if not result.clean:
+        raise typer.Exit(3)
+
+
 def main() -> None:
     """Entry point."""
     run(app)
@@ -111,5 +136,7 @@ def _print_report(report: FlightReport) -> None:
         lost = ", ".join(f"{n} at {stage}" for stage, n in camera.lost.items()) or "0"
         table.add_row(name, f"{camera.width}×{camera.height}", str(camera.recorded), lost)
     Console().print(table)
+    for remark in report.notes:
+        say(f"note: {remark}")
     for problem in report.problems:
         say(f"PROBLEM: {problem}")

@@ -17,8 +17,9 @@ from capture.camera import make_camera
 from capture.camera.base import Camera, CameraDescription
 from capture.clock import Clock
 from capture.config import Config, LoadedConfig
+from capture.disk import Disk
 from capture.errors import CameraError, DiskError, TriggerBoardError
-from capture.flight import make_folder, write_metadata
+from capture.flight import metadata_yaml
 from capture.grabber import Grabber, SideGate
 from capture.ledger import CameraAccount, Ledger, Place
 from capture.record import SIDES, Diagnostic, Loss, Trigger, encode_diagnostics
@@ -97,10 +98,12 @@ class AuxLog:
         self._clock = clock
         self._messages: list[SmallMessage] = []
         self._diagnostics = 0
+        self.triggers = 0  # pulses reported by the board
         self._mutex = threading.Lock()
 
     def trigger(self, trigger: Trigger) -> None:
         """A pulse of the board."""
+        self.triggers += 1
         self._add(SmallMessage(1, trigger.index, trigger.receive_time_ns, trigger.reported_time_ns, trigger.encode()))
 
     def loss(self, loss: Loss) -> None:
@@ -127,7 +130,8 @@ class AuxLog:
 class Recording:
     """One flight being recorded. Owns every thread and device; ``run`` leaves all of them closed."""
 
-    def __init__(self, loaded: LoadedConfig, clock: Clock, progress: Callable[[str], None]) -> None:
+    def __init__(self, loaded: LoadedConfig, clock: Clock, disk: Disk, progress: Callable[[str], None]) -> None:
+        self._disk = disk
         self._loaded = loaded
         self._config: Config = loaded.config
         self._clock = clock
@@ -207,7 +211,8 @@ class Recording:
                 continue
             disk: Path = getattr(self._config.disks, side)
             try:
-                folder = make_folder(disk, self.flight)
+                folder = disk / self.flight
+                self._disk.make_folder(folder)
             except OSError as error:
                 raise DiskError(
                     f"{disk}: cannot be written ({error.strerror}): mount the disk, or correct `disks.{side}`"
@@ -218,6 +223,7 @@ class Recording:
                 names,
                 (height, width),
                 self._config.disks,
+                self._disk,
                 provenance,
                 self._ledger,
                 self._clock,
@@ -320,13 +326,16 @@ class Recording:
             "counter_begin": str(before.counter),
             "counter_end": str(count.counter if count else before.counter + next_index - first_index),
             "board_confirmed": str(count is not None).lower(),
+            "triggers_reported": str(self._aux.triggers),
         }
         for recorder in self._recorders.values():
             recorder.close(end)
             if recorder.failure is not None:
                 self._failures.append(str(recorder.failure))
             else:
-                write_metadata(recorder.folder, [*recorder.segments, recorder.aux])
+                self._disk.write_text(
+                    recorder.folder / "metadata.yaml", metadata_yaml([*recorder.segments, recorder.aux])
+                )
         return self._result(next_index - first_index, seconds)
 
     def _write_last_losses(self) -> None:

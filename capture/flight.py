@@ -3,22 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from capture.errors import RecordingError, UsageError
+from capture.errors import RecordingError
 from capture.segment import SegmentWriter
-
-
-def make_folder(disk: Path, name: str) -> Path:
-    """A new folder for a flight on a disk.
-
-    Raises:
-        UsageError: there is one of this name already; recordings are never written over.
-        OSError: the disk refuses.
-    """
-    folder = disk / name
-    if folder.exists():
-        raise UsageError(f"{folder}: exists already and is not written over: choose another flight name")
-    folder.mkdir(parents=True)
-    return folder
 
 
 def find_folders(paths: Sequence[Path]) -> list[Path]:
@@ -44,8 +30,8 @@ def find_folders(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def write_metadata(folder: Path, segments: Sequence[SegmentWriter]) -> None:
-    """Write ``metadata.yaml`` (rosbag2's, version 5) for the closed segments of a folder."""
+def metadata_yaml(segments: Sequence[SegmentWriter]) -> str:
+    """The text of ``metadata.yaml`` (rosbag2's, version 5) for the closed segments of one folder."""
     first = min((s.first_log_ns for s in segments if s.first_log_ns), default=0)
     last = max((s.last_log_ns for s in segments), default=first)
     counts: dict[tuple[str, str], int] = {}
@@ -84,4 +70,4 @@ def write_metadata(folder: Path, segments: Sequence[SegmentWriter]) -> None:
             f"        nanoseconds: {max(0, segment.last_log_ns - segment.first_log_ns)}",
             f"      message_count: {sum(segment.message_counts.values())}",
         ]
-    (folder / "metadata.yaml").write_text("\n".join(lines) + "\n")
+    return "\n".join(lines) + "\n"

@@ -7,6 +7,8 @@ from capture.trigger import TriggerLog
 
 REPORT_WAIT_S = 0.03
 """How long a frame waits for the board's report of its trigger; the report normally came long before."""
+FIRST_REPORT_WAIT_S = 0.2
+"""The same for a camera's first frame, which nothing but the report can number. The driver's buffers bridge it."""
 
 
 @dataclass(frozen=True)
@@ -60,4 +62,4 @@ class FrameNumbering:
     def _by_host_time(self, grab: Grab) -> tuple[int, int] | None:
         readout_ns = self._camera.row_time_ns * self._camera.height
         latest_ns = grab.receive_ns - grab.exposure_us * 1000 - readout_ns
-        return self._triggers.latest_before(latest_ns, REPORT_WAIT_S)
+        return self._triggers.latest_before(latest_ns, FIRST_REPORT_WAIT_S)

@@ -1,6 +1,5 @@
 """The write thread of one disk: sealed frames and aux batches to segments, with rotation and a guard of free space."""
 
-import os
 import queue
 from collections import deque
 from collections.abc import Sequence
@@ -9,6 +8,7 @@ from pathlib import Path
 
 from capture.clock import Clock
 from capture.config import DiskConfig
+from capture.disk import Disk
 from capture.errors import DiskError
 from capture.ledger import Ledger, Place
 from capture.record import (
@@ -31,6 +31,8 @@ AUX_CHANNELS = (
     Channel(3, DIAGNOSTICS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray"),
 )
 AUX_QUEUE = 1024
+SYNC_PERIOD_S = 0.5  # what a power cut may take with it, while the disk keeps up
+PREALLOCATE_BYTES = 4e9
 _SPACE_CHECK_EVERY = 32  # frames
 
 
@@ -84,7 +86,8 @@ class Recorder(Worker):
         folder: Path,
         cameras: Sequence[str],
         size: tuple[int, int],
-        disk: DiskConfig,
+        config: DiskConfig,
+        disk: Disk,
         provenance: dict[str, str],
         ledger: Ledger,
         clock: Clock,
@@ -98,9 +101,10 @@ class Recorder(Worker):
         self.statistics = WriteStatistics()
         self.segments: list[SegmentWriter] = []
         self.aux_dropped = 0
-        self.write_mode: str = disk.write
+        self.write_mode: str = config.write
         self._cameras = tuple(cameras)
         self._size = size
+        self._config = config
         self._disk = disk
         self._provenance = provenance
         self._ledger = ledger
@@ -109,8 +113,9 @@ class Recorder(Worker):
         self._queue: queue.Queue[FrameItem | AuxItem] = queue.Queue(queue_bound + AUX_QUEUE)
         self._segment_started_s = 0.0
         self._current: SegmentWriter | None = None
+        self._synced_s = clock.monotonic_s()
         self.aux = SegmentWriter(
-            folder / "aux_0000.mcap", AUX_CHANNELS, {**provenance, "side": side, "segment": "0"}, "buffered"
+            disk, folder / "aux_0000.mcap", AUX_CHANNELS, {**provenance, "side": side, "segment": "0"}, "buffered"
         )
         self._open_segment()
 
@@ -168,6 +173,10 @@ class Recorder(Worker):
 
     def _write(self, item: FrameItem) -> None:
         segment = self._segment_with_room()
+        if self._clock.monotonic_s() - self._synced_s > SYNC_PERIOD_S:
+            segment.sync()
+            self.aux.sync()
+            self._synced_s = self._clock.monotonic_s()
         begin_s = self._clock.monotonic_s()
         segment.write_frame(item.sealed)
         took_us = int((self._clock.monotonic_s() - begin_s) * 1e6)
@@ -188,8 +197,8 @@ class Recorder(Worker):
         if self.statistics.frames % _SPACE_CHECK_EVERY == 0:
             self._guard_space()
         segment = self._current
-        old = self._clock.monotonic_s() - self._segment_started_s > self._disk.segment_s
-        if segment is None or old or segment.bytes_written > self._disk.segment_mb * 1e6:
+        old = self._clock.monotonic_s() - self._segment_started_s > self._config.segment_s
+        if segment is None or old or segment.bytes_written > self._config.segment_mb * 1e6:
             if segment is not None:
                 segment.close()
             segment = self._open_segment()
@@ -199,10 +208,12 @@ class Recorder(Worker):
         number = len(self.segments)
         channels = camera_channels(self._cameras, self.side)
         segment = SegmentWriter(
+            self._disk,
             self.folder / f"{self.side}_{number:04d}.mcap",
             channels,
             {**self._provenance, "side": self.side, "segment": str(number)},
-            self._disk.write,
+            self._config.write,
+            preallocate_bytes=round(min(self._config.segment_mb * 1e6, PREALLOCATE_BYTES)),
         )
         self.write_mode = segment.write_mode
         now_ns = self._clock.utc_ns()
@@ -228,13 +239,12 @@ class Recorder(Worker):
 
     def _guard_space(self) -> None:
         try:
-            space = os.statvfs(self.folder)
+            free_mb = self._disk.free_bytes(self.folder) / 1e6
         except OSError as error:
             raise DiskError(f"{self.folder}: the disk is gone ({error.strerror}): check its connection") from error
-        free_mb = space.f_bavail * space.f_frsize / 1e6
-        if free_mb < self._disk.reserve_mb:
+        if free_mb < self._config.reserve_mb:
             raise DiskError(
-                f"{self.folder}: {free_mb:.0f} MB free is less than the reserve of {self._disk.reserve_mb:.0f} MB: "
+                f"{self.folder}: {free_mb:.0f} MB free is less than the reserve of {self._config.reserve_mb:.0f} MB: "
                 "free space on this disk"
             )
 

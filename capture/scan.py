@@ -1,4 +1,4 @@
-"""One MCAP file to its chunks and messages, record by record, up to where it is whole; what is wrong is listed."""
+"""One MCAP file to its chunks and messages, record by record; what is wrong is listed, and what follows it is found."""
 
 import io
 import mmap
@@ -20,6 +20,8 @@ from capture.segment import GUARD, GUARD_OPCODE, MAGIC, PADDING_OPCODE
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQIIQ")
+_SEARCH_BYTES = 1 << 20
+_KNOWN = frozenset({*Opcode, PADDING_OPCODE, GUARD_OPCODE})
 FOOTER_BYTES = 9 + 20 + len(MAGIC)
 _FOOTER_HEAD = _RECORD.pack(Opcode.FOOTER, 20)
 
@@ -33,6 +35,7 @@ class ScannedMessage:
     log_ns: int
     publish_ns: int
     data: memoryview
+    chunk_at: int  # where its chunk begins: frames and their metadata share one
 
 
 @dataclass
@@ -43,7 +46,9 @@ class Scan:
     size: int
     provenance: dict[str, str] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    topics: dict[int, str] = field(default_factory=dict)
+    topics: dict[int, str] = field(default_factory=dict)  # by channel id
+    types: dict[str, str] = field(default_factory=dict)  # by topic
+    schemas: dict[int, str] = field(default_factory=dict)
     chunks: int = 0
     closed: bool = False  # has DataEnd, summary and footer
     problems: list[str] = field(default_factory=list)
@@ -74,8 +79,13 @@ def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
     while at + _RECORD.size <= found.size:
         opcode, length = _RECORD.unpack_from(data, at)
         end = at + _RECORD.size + length
-        if opcode == 0 or end > found.size:
-            break
+        if opcode == 0 or end > found.size or opcode not in _KNOWN:
+            after = _next_chunk(data, at)
+            if after is None:
+                break
+            found.problems.append(f"bytes {at} to {after} are damaged: a hole")
+            at, open_from = after, None
+            continue
         body = data[at + _RECORD.size : end]
         if opcode in (Opcode.CHUNK, Opcode.DATA_END):
             _demand(found, at, open_from is None, "records before this that no checksum covers")
@@ -105,6 +115,36 @@ def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
     )
 
 
+def _next_chunk(data: memoryview, at: int) -> int | None:
+    """Where the next chunk with a good CRC begins after the damaged byte ``at``; None when there is none."""
+    begins = bytes([Opcode.CHUNK])
+    searched = at + 1
+    while searched < len(data):
+        window = bytes(data[searched : searched + _SEARCH_BYTES])
+        offset = window.find(begins)
+        while offset >= 0:
+            start = searched + offset
+            if _good_chunk(data, start):
+                return start
+            offset = window.find(begins, offset + 1)
+        searched += _SEARCH_BYTES
+    return None
+
+
+def _good_chunk(data: memoryview, at: int) -> bool:
+    body_at = at + _RECORD.size
+    if body_at + _CHUNK.size > len(data):
+        return False
+    _, length = _RECORD.unpack_from(data, at)
+    size: int
+    crc: int
+    _, _, size, crc, compression, stored = _CHUNK.unpack_from(data, body_at)
+    content_at = body_at + _CHUNK.size
+    if compression or size != stored or length != _CHUNK.size + size or not size or content_at + size > len(data):
+        return False
+    return zlib.crc32(data[content_at : content_at + size]) == crc
+
+
 def _demand(found: Scan, at: int, fulfilled: bool, otherwise: str) -> None:
     if not fulfilled:
         found.problems.append(f"byte {at}: {otherwise}")
@@ -120,7 +160,11 @@ def _take_record(found: Scan, opcode: int, body: memoryview, at: int) -> None:
         elif opcode == Opcode.CHANNEL:
             channel = records.Channel.read(_stream(body))
             found.topics[channel.id] = channel.topic
-        elif opcode not in (Opcode.HEADER, Opcode.SCHEMA, Opcode.ATTACHMENT):
+            found.types[channel.topic] = found.schemas.get(channel.schema_id, "")
+        elif opcode == Opcode.SCHEMA:
+            schema = records.Schema.read(_stream(body))
+            found.schemas[schema.id] = schema.name
+        elif opcode not in (Opcode.HEADER, Opcode.ATTACHMENT):
             found.problems.append(f"byte {at}: a record of kind {opcode:#x} that does not belong here")
     except (McapError, ValueError, struct.error) as error:
         found.problems.append(f"byte {at}: a record that cannot be read ({error})")
@@ -153,6 +197,7 @@ def _chunk(found: Scan, body: memoryview, at: int, index: dict[int, list[tuple[i
                 log_ns,
                 publish_ns,
                 content[start + _MESSAGE.size : start + length],
+                at,
             )
         inner = start + length
     times = [log_ns for entries in index.values() for log_ns, _ in entries]

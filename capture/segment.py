@@ -14,9 +14,8 @@ Readers skip private records (MCAP specification, opcodes 0x80–0xFF); offsets,
 multiples of the page size, as O_DIRECT wants.
 """
 
-import fcntl
+import contextlib
 import mmap
-import os
 import struct
 import zlib
 from collections.abc import Sequence
@@ -27,6 +26,7 @@ from typing import Any
 from mcap import records
 from mcap.data_stream import RecordBuilder
 
+from capture.disk import Disk, DiskFile
 from capture.errors import DiskError
 from capture.record import FORMAT_VERSION, PROVENANCE, SCHEMAS, Frame, image_prefix
 from capture.ring import PAGE
@@ -147,7 +147,13 @@ class SegmentWriter:
     """Writes one MCAP file. One thread; every failure of the disk is a DiskError that names the file."""
 
     def __init__(
-        self, path: Path, channels: Sequence[Channel], provenance: dict[str, str], write_mode: str = "auto"
+        self,
+        disk: Disk,
+        path: Path,
+        channels: Sequence[Channel],
+        provenance: dict[str, str],
+        write_mode: str = "auto",
+        preallocate_bytes: int = 0,
     ) -> None:
         self.path = path
         self.bytes_written = 0
@@ -160,13 +166,12 @@ class SegmentWriter:
         self._channels = tuple(channels)
         names = sorted({channel.type_name for channel in channels})
         self._schema_ids = {name: number for number, name in enumerate(names, start=1)}
-        self._file, self.direct = self._open(write_mode)
+        try:
+            self._file: DiskFile | None = disk.create(path, write_mode, preallocate_bytes)
+        except OSError as error:
+            raise self._disk_error(error) from error
+        self.write_mode = "direct" if self._file.direct else "buffered"
         self._start({"format_version": str(FORMAT_VERSION), "write_mode": self.write_mode, **provenance})
-
-    @property
-    def write_mode(self) -> str:
-        """``direct`` or ``buffered``."""
-        return "direct" if self.direct else "buffered"
 
     def topics(self) -> list[tuple[str, str, int]]:
         """Topic, type and number of messages of each channel."""
@@ -254,26 +259,23 @@ class SegmentWriter:
         self._write_block(block + self._guard(block))
 
     def sync(self) -> None:
-        """Wait until what was written is on the disk."""
+        """Wait until what was written would survive a power cut."""
         try:
-            os.fdatasync(self._file)
+            self._open_file().sync()
         except OSError as error:
             raise self._disk_error(error) from error
 
     def close(self) -> None:
         """Write the summary, and wait until all of the file is on the disk. Safe to call twice."""
-        if self._file < 0:
+        if self._file is None:
             return
         try:
-            if self.direct:  # the summary is no multiple of a page
-                flags = fcntl.fcntl(self._file, fcntl.F_GETFL)
-                fcntl.fcntl(self._file, fcntl.F_SETFL, flags & ~os.O_DIRECT)
-                self.direct = False
+            self._file.end_direct()  # the summary is no multiple of a page
             end = RecordBuilder()
             records.DataEnd(data_section_crc=0).write(end)
             self._write(memoryview(end.end()))
             self._write(memoryview(self._summary(self.bytes_written)))
-            os.fsync(self._file)
+            self._file.sync()
         except OSError as error:
             raise self._disk_error(error) from error
         finally:
@@ -281,23 +283,15 @@ class SegmentWriter:
 
     def abandon(self) -> None:
         """Let go of the file as it is: readable up to its last complete chunk."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
+        if self._file is not None:
+            file, self._file = self._file, None
+            with contextlib.suppress(OSError):  # the disk has failed, or everything was synced before
+                file.close()
 
-    def _open(self, write_mode: str) -> tuple[int, bool]:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-        try:
-            if write_mode != "buffered":
-                try:
-                    return os.open(self.path, flags | os.O_DIRECT, 0o644), True
-                except OSError as error:  # EINVAL: this file system has no O_DIRECT
-                    if write_mode == "direct" or error.errno != 22:
-                        raise
-                    self.path.unlink(missing_ok=True)
-            return os.open(self.path, flags, 0o644), False
-        except OSError as error:
-            raise self._disk_error(error) from error
+    def _open_file(self) -> DiskFile:
+        if self._file is None:
+            raise ValueError(f"{self.path} is closed")
+        return self._file
 
     def _start(self, provenance: dict[str, str]) -> None:
         out = RecordBuilder()
@@ -326,7 +320,7 @@ class SegmentWriter:
 
     def _write_block(self, block: bytes) -> None:
         """Write records that do not come from a slot, filled up to a page where the file is direct."""
-        if not self.direct:
+        if not self._open_file().direct:
             self._write(memoryview(block))
             return
         length = _round_up(len(block) + _RECORD.size, PAGE)
@@ -338,10 +332,11 @@ class SegmentWriter:
             view.release()
 
     def _write(self, view: memoryview) -> None:
+        file = self._open_file()
         try:
-            done = os.write(self._file, view)
-            while done < len(view):  # a short write: the rest says why
-                done += os.write(self._file, view[done:])
+            done = file.write(view)
+            while done < len(view):  # a short write: what comes of the rest says why
+                done += file.write(view[done:])
         except OSError as error:
             raise self._disk_error(error) from error
         self.bytes_written += len(view)

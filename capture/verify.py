@@ -36,8 +36,11 @@ class FlightReport:
     triggers: int = 0
     first_trigger_ns: int = 0
     last_trigger_ns: int = 0
+    first_index: int = 0
+    next_index: int = 0  # one past the last trigger
     provenance: dict[str, str] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)  # any of them: not whole
+    notes: list[str] = field(default_factory=list)  # accounted for, but worth knowing
 
     @property
     def whole(self) -> bool:
@@ -87,6 +90,7 @@ class FlightReport:
             "flight": self.provenance.get("flight", ""),
             "version": self.provenance.get("version", ""),
             "problems": self.problems,
+            "notes": self.notes,
         }
 
 
@@ -170,18 +174,11 @@ def _check_books(report: FlightReport, pulses: dict[int, Trigger], ends: list[di
     if pulses:
         report.first_trigger_ns = pulses[min(pulses)].reported_time_ns
         report.last_trigger_ns = pulses[max(pulses)].reported_time_ns
-    if ends:
-        first, after = int(ends[0]["first_index"]), int(ends[0]["next_index"])
-        edges = int(ends[0]["counter_end"]) - int(ends[0]["counter_begin"])
-        if edges != after - first:
-            report.problems.append(f"the board's counter went on by {edges}, its index by {after - first}")
-    else:
-        report.problems.append("no file has the board's final count: the recording was not closed")
-        first, after = min(pulses, default=0), max(pulses, default=-1) + 1
-    report.triggers = after - first
+    first, after = _board_range(report, pulses, ends)
+    report.first_index, report.next_index, report.triggers = first, after, after - first
     unreported = report.triggers - sum(1 for index in pulses if first <= index < after)
     if unreported:
-        report.problems.append(f"{unreported} triggers have no /trigger message: lines from the board were lost")
+        report.notes.append(f"{unreported} triggers were not reported by the board: their times are interpolated")
     for name, camera in sorted(report.cameras.items()):
         camera.lost = dict(Counter(loss.stage for loss in camera.lost_indices.values()))
         for index in range(first, after):
@@ -191,3 +188,22 @@ def _check_books(report: FlightReport, pulses: dict[int, Trigger], ends: list[di
         strays = [index for index in camera.indices if not first <= index < after]
         if strays:
             report.problems.append(f"{name}: {len(strays)} frames of triggers that the board never gave")
+
+
+def _board_range(report: FlightReport, pulses: dict[int, Trigger], ends: list[dict[str, str]]) -> tuple[int, int]:
+    """First and one-past-last trigger index by the board's final count, else by its reports."""
+    try:
+        first, after = int(ends[0]["first_index"]), int(ends[0]["next_index"])
+        edges = int(ends[0]["counter_end"]) - int(ends[0]["counter_begin"])
+        reported = int(ends[0]["triggers_reported"])
+    except (IndexError, KeyError, ValueError):
+        report.problems.append("no file has the board's final count: the recording was not closed")
+        seen = {*pulses, *(index for camera in report.cameras.values() for index in camera.indices)}
+        return min(seen, default=0), max(seen, default=-1) + 1
+    if edges != after - first:
+        report.problems.append(f"the board's counter went on by {edges}, its index by {after - first}")
+    if reported != len(pulses):
+        report.problems.append(f"{reported} /trigger messages were recorded, {len(pulses)} are in the files")
+    if ends[0].get("board_confirmed") != "true":
+        report.notes.append("the board could not be asked for its final count: the last triggers may be missing")
+    return first, after

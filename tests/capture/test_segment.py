@@ -11,6 +11,7 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 
+from capture.disk import SystemDisk
 from capture.errors import DiskError
 from capture.record import Frame, image_prefix
 from capture.recorder import camera_channels
@@ -23,7 +24,7 @@ def frame_of(index: int) -> Frame:
 
 
 def write(path, layout, ring, count, mode):
-    writer = SegmentWriter(path, camera_channels(["cam0"], "left"), {"flight": "x"}, mode)
+    writer = SegmentWriter(SystemDisk(), path, camera_channels(["cam0"], "left"), {"flight": "x"}, mode)
     for index in range(count):
         slot = ring.slot(ring.take())
         layout.pixels(slot)[:] = bytes([index]) * layout.pixels_size
@@ -75,7 +76,7 @@ def test_layout_is_aligned_for_any_size(width, height, name):
 def test_a_short_write_and_a_full_disk_name_the_file(tmp_path, monkeypatch):
     layout = FrameLayout(1, 2, "left_cam0", 64, 48)
     ring = Ring(2, layout.slot_bytes, lock_memory=False)
-    writer = SegmentWriter(tmp_path / "left_0000.mcap", camera_channels(["cam0"], "left"), {}, "buffered")
+    writer = SegmentWriter(SystemDisk(), tmp_path / "left_0000.mcap", camera_channels(["cam0"], "left"), {}, "buffered")
     slot = ring.slot(ring.take())
     real_write, calls = os.write, []
 
@@ -85,7 +86,7 @@ def test_a_short_write_and_a_full_disk_name_the_file(tmp_path, monkeypatch):
             return real_write(file, data[:100])
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("capture.segment.os.write", short_then_full)
+    monkeypatch.setattr("capture.disk.os.write", short_then_full)
     with pytest.raises(DiskError, match=r"left_0000\.mcap.*No space left"):
         writer.write_frame(layout.seal(slot, frame_of(0), 5))
     assert calls == [layout.slot_bytes, layout.slot_bytes - 100]

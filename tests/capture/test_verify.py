@@ -12,6 +12,7 @@ import pytest
 from capture.clock import SystemClock
 from capture.config import load_config
 from capture.daemon import Recording, StopRule
+from capture.disk import SystemDisk
 from capture.errors import RecordingError
 from capture.verify import inspect
 
@@ -19,7 +20,9 @@ from capture.verify import inspect
 @pytest.fixture
 def flight(write_config, rig, tmp_path) -> Path:
     rig.missed = {("left_cam1", 2)}
-    Recording(load_config(write_config()), SystemClock(), lambda _: None).run(StopRule(threading.Event(), 6))
+    Recording(load_config(write_config()), SystemClock(), SystemDisk(), lambda _: None).run(
+        StopRule(threading.Event(), 6)
+    )
     assert inspect([tmp_path]).problems == []
     return tmp_path
 
