@@ -1,0 +1,342 @@
+"""A result → the figures of its report: the wing, its motion, and how well model and markers agree."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from reconstruct.result import Result, SideResult
+from reconstruct.tables import Floats, Ints, rms
+
+COLOURS = {"left": "#2a6496", "right": "#b5502a"}
+INSTANT_COLOURS = ("#54709e", "#3d3d3d", "#b5502a")
+GREY = "#a9adb2"
+STYLE: dict[str, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelcolor": "#444444",
+    "axes.edgecolor": "#888888",
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e6e8",
+    "grid.linewidth": 0.7,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "lines.linewidth": 1.3,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "figure.facecolor": "white",
+    "savefig.dpi": 150,
+}
+WIDTH_IN = 8.4
+
+
+def wing_3d(result: Result) -> Figure:
+    """Both half wings in space at the lowest, the middle and the highest instant; the unloaded wing in grey."""
+    height_in, wide = 3.1, 0.9  # the axes are a square as wide as the picture, which shows its middle
+    figure = Figure(figsize=(WIDTH_IN, height_in))
+    tall = wide * WIDTH_IN / height_in
+    axes: Any = figure.add_axes((0.5 - wide / 2, 0.52 - tall / 2, wide, tall), projection="3d", computed_zorder=False)
+    for side in result.sides.values():
+        axes.plot(
+            *side.unloaded_xyz_m.T, color=GREY, linewidth=2.2, label="unloaded" if side is _first(result) else None
+        )
+    for (name, triggers), colour in zip(chosen_sets(result).items(), INSTANT_COLOURS, strict=False):
+        for side in result.sides.values():
+            rows = np.flatnonzero(side.shape.trigger_index == triggers[side.shape.side])
+            label = f"{name}, {_seconds(result, side)[rows[0]]:.2f} s" if side is _first(result) else None
+            axes.plot(*side.shape.xyz_m[rows[0]].T, color=colour, linewidth=1.8, label=label)
+            _ribs(axes, side, int(triggers[side.shape.side]), colour)
+    _equal_box(axes, result)
+    axes.set_xticks([])  # the chord is too short for a scale
+    axes.set_ylabel("to the right, m", labelpad=18)
+    axes.set_zlabel("up, m", labelpad=4)
+    axes.view_init(elev=16, azim=-22)  # from behind and a little to the left
+    figure.legend(loc="upper left", bbox_to_anchor=(0.02, 0.98))
+    return figure
+
+
+def tip(result: Result) -> Figure:
+    """Displacement of the tip and its twist in time, with bands of two sigma."""
+    figure, axes = _panels(3, 1, 5.6)
+    for name, side in result.sides.items():
+        time = _seconds(result, side)
+        for axis, (value, scale) in zip(
+            axes, (("tip_dz_m", 1e3), ("tip_dx_m", 1e3), ("tip_twist_deg", 1.0)), strict=True
+        ):
+            _band(axis, time, scale * side.frames[value], scale * side.frames[f"sigma_{value}"], name)
+    axes[0].set(title="Tip displacement from the unloaded wing, up", ylabel="mm")
+    axes[1].set(title="Tip displacement from the unloaded wing, aft", ylabel="mm")
+    axes[2].set(title="Tip twist, nose-up", ylabel="deg", xlabel=_time_label(result))
+    _legend(axes[0])
+    return figure
+
+
+def span(result: Result) -> Figure:
+    """Vertical displacement and twist along the span: all sets as bands, chosen instants as lines."""
+    figure = Figure(figsize=(WIDTH_IN, 4.9), layout="constrained")
+    grid = figure.subplots(2, len(result.sides), sharex="col", sharey="row", squeeze=False)
+    instants = chosen_sets(result)
+    for column, (name, side) in enumerate(result.sides.items()):
+        lift = 1e3 * (side.shape.xyz_m - side.unloaded_xyz_m)[..., 2]
+        for axis, values in zip(grid[:, column], (lift, side.shape.twist_deg), strict=True):
+            _envelope(axis, side.shape.s_m, values)
+            for (label, triggers), colour in zip(instants.items(), INSTANT_COLOURS, strict=False):
+                row = np.flatnonzero(side.shape.trigger_index == triggers[name])[0]
+                axis.plot(side.shape.s_m, values[row], color=colour, label=label)
+            axis.axhline(0.0, color=GREY, linewidth=1.0, zorder=1)
+        grid[0, column].set(title=f"{name.capitalize()} wing: displacement, up")
+        grid[1, column].set(title=f"{name.capitalize()} wing: twist", xlabel="along the span s, m")
+        if name == "left":  # as the wing hangs on the aircraft: tip outside
+            grid[1, column].invert_xaxis()
+    grid[0, 0].set_ylabel("mm")
+    grid[1, 0].set_ylabel("deg")
+    grid[0, -1].legend(loc="best")
+    return figure
+
+
+def sigmas(result: Result) -> Figure:
+    """What the fit states of its own uncertainty, along the span (median over all sets)."""
+    figure, axes = _panels(1, 2, 2.7, sharex=False)
+    for name, side in result.sides.items():
+        fitted = np.isfinite(side.shape.xyz_m).all(axis=(1, 2))
+        if not fitted.any():
+            continue
+        distance = np.linalg.norm(side.shape.sigma_xyz_m[fitted], axis=-1)
+        axes[0].plot(side.shape.s_m, 1e3 * np.median(distance, axis=0), color=COLOURS[name], label=name)
+        axes[1].plot(side.shape.s_m, np.median(side.shape.sigma_twist_deg[fitted], axis=0), color=COLOURS[name])
+    axes[0].set(title="One sigma of the position", xlabel="along the span s, m", ylabel="mm", ylim=(0, None))
+    axes[1].set(title="One sigma of the twist", xlabel="along the span s, m", ylabel="deg", ylim=(0, None))
+    axes[0].legend(loc="upper left")
+    return figure
+
+
+def residuals_in_time(result: Result) -> Figure:
+    """RMS distance between measured and fitted markers, and χ² a degree of freedom, set by set."""
+    figure, axes = _panels(2, 1, 3.7)
+    for name, side in result.sides.items():
+        time = _seconds(result, side)
+        axes[0].plot(time, side.frames["residual_rms_mm"], color=COLOURS[name], label=name, linewidth=1.0)
+        axes[1].plot(time, side.frames["chi2_per_dof"], color=COLOURS[name], linewidth=1.0)
+    axes[1].axhline(1.0, color=GREY, linewidth=1.0, linestyle="--")
+    axes[0].set(title="Residual of the markers (RMS of the set)", ylabel="mm", ylim=(0, None))
+    axes[1].set(title="χ² a degree of freedom (1: as the stated noise)", xlabel=_time_label(result), ylim=(0, None))
+    _legend(axes[0])
+    return figure
+
+
+def residuals_by_marker(result: Result) -> Figure:
+    """RMS residual of each marker over all sets, on the wing's plan."""
+    values = {name: 1e3 * rms(np.linalg.norm(side.residual_m, axis=-1), axis=0) for name, side in result.sides.items()}
+    markers = {name: side.residual_marker for name, side in result.sides.items()}
+    return marker_map(markers, values, "RMS residual, mm", "{:.2f}", "YlOrBr")
+
+
+def markers_seen(result: Result) -> Figure:
+    """Share of the sets in which each marker was measured, on the wing's plan."""
+    values = {name: 100.0 * side.markers.seen.mean(axis=0) for name, side in result.sides.items()}
+    return marker_map(_measured(result), values, "measured in … % of the sets", "{:.0f}", "Blues", limits=(0.0, 220.0))
+
+
+def loads(result: Result) -> Figure:
+    """Sum of the fitted loads and their moment at the root, in time."""
+    figure, axes = _panels(2, 1, 3.7)
+    for name, side in result.sides.items():
+        time = _seconds(result, side)
+        _band(axes[0], time, side.frames["net_fz_n"], side.frames["sigma_net_fz_n"], name)
+        tip_up = 1.0 if name == "right" else -1.0
+        _band(axes[1], time, tip_up * side.frames["net_mx_nm"], side.frames["sigma_net_mx_nm"], name)
+    axes[0].set(title="Sum of the fitted forces, up", ylabel="N")
+    axes[1].set(title="Their bending moment at the root, tip up", ylabel="N·m", xlabel=_time_label(result))
+    _legend(axes[0])
+    return figure
+
+
+def error_in_time(result: Result) -> Figure:
+    """Error of shape, tip and twist against the reference, set by set."""
+    figure, axes = _panels(3, 1, 5.2)
+    for name, errors in result.errors.items():
+        time = (errors.timestamp_ns - result.start_ns) * 1e-9
+        distance = 1e3 * np.linalg.norm(errors.shape_m, axis=-1)
+        axes[0].plot(time, rms(distance, axis=1), color=COLOURS[name], label=name, linewidth=1.0)
+        axes[1].plot(time, distance[:, -1], color=COLOURS[name], linewidth=1.0)
+        axes[2].plot(time, rms(errors.twist_deg, axis=1), color=COLOURS[name], linewidth=1.0)
+    axes[0].set(title="Shape error (RMS over the stations)", ylabel="mm", ylim=(0, None))
+    axes[1].set(title="Tip error (3-D distance)", ylabel="mm", ylim=(0, None))
+    axes[2].set(title="Twist error (RMS over the stations)", ylabel="deg", ylim=(0, None), xlabel=_time_label(result))
+    _legend(axes[0])
+    return figure
+
+
+def error_along_span(result: Result) -> Figure:
+    """RMS error along the span (solid) beside the sigma that the fit states (dashed)."""
+    figure, axes = _panels(1, 2, 2.9, sharex=False)
+    for name, errors in result.errors.items():
+        shape = result.sides[name].shape
+        known = np.isfinite(errors.shape_m).all(axis=-1)
+        stated = np.where(known, np.linalg.norm(shape.sigma_xyz_m, axis=-1), np.nan)
+        axes[0].plot(
+            shape.s_m, 1e3 * rms(np.linalg.norm(errors.shape_m, axis=-1), axis=0), color=COLOURS[name], label=name
+        )
+        axes[0].plot(shape.s_m, 1e3 * rms(stated, axis=0), color=COLOURS[name], linestyle="--", linewidth=1.0)
+        axes[1].plot(shape.s_m, rms(errors.twist_deg, axis=0), color=COLOURS[name])
+        stated_twist = np.where(known, shape.sigma_twist_deg, np.nan)
+        axes[1].plot(shape.s_m, rms(stated_twist, axis=0), color=COLOURS[name], linestyle="--", linewidth=1.0)
+    axes[0].plot([], [], color="#555555", linestyle="--", linewidth=1.0, label="stated sigma")
+    axes[0].set(title="Position error (RMS)", xlabel="along the span s, m", ylabel="mm", ylim=(0, None))
+    axes[1].set(title="Twist error (RMS)", xlabel="along the span s, m", ylabel="deg", ylim=(0, None))
+    axes[0].legend(loc="upper left")
+    return figure
+
+
+def error_by_marker(result: Result) -> Figure:
+    """RMS 3-D error of each measured marker against the reference, on the wing's plan."""
+    values = {
+        name: 1e3 * rms(np.linalg.norm(errors.marker_m, axis=-1), axis=0) for name, errors in result.errors.items()
+    }
+    return marker_map(_measured(result), values, "RMS 3-D error, mm", "{:.2f}", "YlOrBr")
+
+
+def marker_map(
+    markers: Mapping[str, Ints],
+    values: Mapping[str, Floats],
+    label: str,
+    text: str,
+    colours: str,
+    limits: tuple[float, float] | None = None,
+) -> Figure:
+    """A number a marker on the plan of the wing: left tip … root … right tip, fore row above aft row."""
+    pairs = 1 + max(int(own.max()) // 2 for own in markers.values())
+    plan = np.full((2, 2 * pairs), np.nan)
+    for name in values:
+        for marker, value in zip(markers[name], values[name], strict=True):
+            pair, row = divmod(int(marker), 2)
+            plan[row, pairs + pair if name == "right" else pairs - 1 - pair] = value
+    figure = Figure(figsize=(WIDTH_IN, 1.75), layout="constrained")
+    axes = figure.subplots()
+    top = np.nanmax(plan) if np.isfinite(plan).any() else 1.0
+    low, high = limits or (0.0, 2.2 * max(float(top), 1e-9))
+    axes.imshow(plan, cmap=colours, vmin=low, vmax=high, aspect="auto")
+    for (row, column), value in np.ndenumerate(plan):
+        shown = text.format(value) if np.isfinite(value) else "–"
+        axes.text(column, row, shown, ha="center", va="center", fontsize=8, color="#222222")
+    axes.axvline(pairs - 0.5, color="white", linewidth=5)
+    axes.set_xticks(range(2 * pairs), [str(pair) for pair in (*range(pairs - 1, -1, -1), *range(pairs))])
+    axes.set_yticks([0, 1], ["fore", "aft"])
+    axes.set_xlabel("left wing ←      pair, 0 at the root      → right wing")
+    axes.set_title(label)
+    axes.grid(False)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    return figure
+
+
+def _measured(result: Result) -> dict[str, Ints]:
+    return {name: side.markers.marker for name, side in result.sides.items()}
+
+
+def chosen_sets(result: Result) -> dict[str, dict[str, int]]:
+    """Name → trigger index by side: the lowest, the middle and the highest tip seen (fewer when sets are few).
+
+    Taken on the first side; the other side's is the fitted set nearest in trigger index.
+    """
+    first = _first(result)
+    fitted = np.flatnonzero(np.isfinite(first.frames["tip_dz_m"]))
+    if fitted.size == 0:
+        return {}
+    order = fitted[np.argsort(first.frames["tip_dz_m"][fitted], kind="stable")]
+    rows = {"lowest": order[0], "middle": order[order.size // 2], "highest": order[-1]}
+    if order.size < 3:
+        rows = {"lowest": order[0]} if order.size == 1 else {"lowest": order[0], "highest": order[-1]}
+    chosen: dict[str, dict[str, int]] = {}
+    for name, row in rows.items():
+        wanted = int(first.shape.trigger_index[row])
+        chosen[name] = {key: _nearest_fitted(side, wanted) for key, side in result.sides.items()}
+    return chosen
+
+
+def _nearest_fitted(side: SideResult, trigger: int) -> int:
+    fitted = np.isfinite(side.frames["tip_dz_m"])
+    known = side.shape.trigger_index[fitted] if fitted.any() else side.shape.trigger_index
+    return int(known[np.argmin(np.abs(known - trigger))])
+
+
+def _first(result: Result) -> SideResult:
+    """The side with the most fitted sets: the one that instants are chosen on."""
+    return max(result.sides.values(), key=lambda side: int(np.isfinite(side.frames["tip_dz_m"]).sum()))
+
+
+def _seconds(result: Result, side: SideResult) -> Floats:
+    return np.asarray((side.shape.timestamp_ns - result.start_ns) * 1e-9, dtype=np.float64)
+
+
+def _time_label(result: Result) -> str:
+    start = np.datetime64(result.start_ns, "ns").astype("datetime64[ms]")
+    return f"s since {str(start).replace('T', ' ')} UTC"
+
+
+def _panels(rows: int, columns: int, height_in: float, *, sharex: bool = True) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    return figure, figure.subplots(rows, columns, sharex=sharex)
+
+
+def _band(axis: Axes, time: Floats, value: Floats, sigma: Floats, side: str) -> None:
+    axis.fill_between(time, value - 2 * sigma, value + 2 * sigma, color=COLOURS[side], alpha=0.22, linewidth=0)
+    axis.plot(time, value, color=COLOURS[side], label=side)
+
+
+def _legend(axis: Axes) -> None:
+    """On the line of the title, where no curve can run through it."""
+    axis.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2, borderaxespad=0.0)
+
+
+def _envelope(axis: Axes, s_m: Floats, values: Floats) -> None:
+    known = values[np.isfinite(values).all(axis=1)]
+    if known.shape[0] == 0:
+        return
+    low, q05, q95, high = np.percentile(known, (0, 5, 95, 100), axis=0)
+    axis.fill_between(s_m, low, high, color="#eceef0", linewidth=0, label="all sets")
+    axis.fill_between(s_m, q05, q95, color="#d9dde1", linewidth=0, label="90 % of the sets")
+
+
+def _ribs(axes: Any, side: SideResult, trigger: int, colour: str) -> None:
+    """Measured markers as dots, joined fore to aft: they show the chord and its twist."""
+    row = np.flatnonzero(side.markers.trigger_index == trigger)
+    if row.size == 0:
+        return
+    xyz = side.markers.xyz_m[row[0]]
+    axes.scatter(*xyz.T, color=colour, s=5, linewidths=0, depthshade=False)
+    place = {int(marker): at for at, marker in enumerate(side.markers.marker)}
+    for marker, at in place.items():
+        if marker % 2 == 0 and marker + 1 in place:
+            axes.plot(*xyz[[at, place[marker + 1]]].T, color=colour, linewidth=0.9)
+
+
+def _equal_box(axes: Any, result: Result) -> None:
+    """One metre is as long on every axis; panes and grid stay in the background."""
+    points = np.concatenate(
+        [
+            np.concatenate([side.shape.xyz_m.reshape(-1, 3), side.unloaded_xyz_m, side.markers.xyz_m.reshape(-1, 3)])
+            for side in result.sides.values()
+        ]
+    )
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    middle, half = (low + high) / 2, np.maximum((high - low) / 2 * 1.05, 0.25)
+    axes.set(
+        xlim=(middle[0] - half[0], middle[0] + half[0]),
+        ylim=(middle[1] - half[1], middle[1] + half[1]),
+        zlim=(middle[2] - half[2], middle[2] + half[2]),
+    )
+    axes.set_box_aspect(half / half.max(), zoom=1.0)
+    axes.locator_params(axis="z", nbins=4)
+    for pane in (axes.xaxis, axes.yaxis, axes.zaxis):
+        pane.set_pane_color((1.0, 1.0, 1.0, 0.0))

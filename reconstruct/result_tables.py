@@ -1,0 +1,133 @@
+"""Fits of both half wings → the tables of a result folder (docs/reference/result-files.md)."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pyarrow as pa
+
+from reconstruct.series import SideFits
+from reconstruct.tables import (
+    FRAMES,
+    LOAD_COLUMNS,
+    LOADS,
+    NET_COLUMNS,
+    POSITION,
+    RESIDUAL,
+    RESIDUALS,
+    SHAPE,
+    SIGMA,
+    TIP_COLUMNS,
+    UNLOADED,
+    Floats,
+    Words,
+    rms,
+)
+
+
+def result_tables(fits: Mapping[str, SideFits]) -> dict[str, pa.Table]:
+    """File name → table, for shape, frames, loads, residuals and the unloaded wing; the left side's rows come first."""
+    makers = {
+        SHAPE: shape_table,
+        FRAMES: frames_table,
+        LOADS: loads_table,
+        RESIDUALS: residuals_table,
+        UNLOADED: unloaded_table,
+    }
+    return {name: pa.concat_tables([make(fits[side]) for side in sorted(fits)]) for name, make in makers.items()}
+
+
+def shape_table(fits: SideFits) -> pa.Table:
+    """One row a trigger and station."""
+    return pa.table(
+        {
+            **_keys(fits, "station", fits.s_m.size),
+            "s_m": np.tile(fits.s_m, fits.trigger_index.size),
+            **_flat(POSITION, fits.xyz_m),
+            "twist_deg": np.degrees(fits.twist_rad).ravel(),
+            **_flat(SIGMA, fits.sigma_xyz_m),
+            "sigma_twist_deg": np.degrees(fits.sigma_twist_rad).ravel(),
+            "flags": _text(np.repeat(fits.flags, fits.s_m.size)),
+        }
+    )
+
+
+def frames_table(fits: SideFits) -> pa.Table:
+    """One row a trigger: the tip, the net load, how well the fit agrees with its markers."""
+    tip = np.column_stack([(fits.xyz_m - fits.unloaded_xyz_m)[:, -1], np.degrees(fits.twist_rad[:, -1])])
+    sigma_tip = np.column_stack([fits.sigma_xyz_m[:, -1], np.degrees(fits.sigma_twist_rad[:, -1])])
+    residual = np.where(fits.used, np.linalg.norm(fits.residual_m, axis=-1), np.nan)
+    return pa.table(
+        {
+            "trigger_index": fits.trigger_index,
+            "side": _text([fits.side] * fits.trigger_index.size),
+            "timestamp_ns": fits.timestamp_ns,
+            **_flat(TIP_COLUMNS, tip),
+            **_flat([f"sigma_{name}" for name in TIP_COLUMNS], sigma_tip),
+            **_flat(NET_COLUMNS, fits.net),
+            **_flat([f"sigma_{name}" for name in NET_COLUMNS], fits.sigma_net),
+            "residual_rms_mm": 1e3 * rms(residual, axis=1),
+            "chi2_per_dof": fits.chi2 / fits.dof,
+            "markers_used": fits.used.sum(axis=1).astype(np.int32),
+            "iterations": fits.iterations.astype(np.int32),
+            "flags": _text(fits.flags),
+            "reason": _text(fits.reason),
+        }
+    )
+
+
+def loads_table(fits: SideFits) -> pa.Table:
+    """One row a trigger and load station."""
+    return pa.table(
+        {
+            **_keys(fits, "load_station", fits.load_s_m.size),
+            "s_m": np.tile(fits.load_s_m, fits.trigger_index.size),
+            **_flat(LOAD_COLUMNS, fits.loads),
+            **_flat([f"sigma_{name}" for name in LOAD_COLUMNS], fits.sigma_loads),
+        }
+    )
+
+
+def residuals_table(fits: SideFits) -> pa.Table:
+    """One row a trigger and marker: measured minus fitted."""
+    sets, markers = fits.used.shape
+    return pa.table(
+        {
+            "trigger_index": np.repeat(fits.trigger_index, markers),
+            "side": _text([fits.side] * fits.used.size),
+            "marker": np.tile(fits.markers.marker, sets).astype(np.int32),
+            **_flat(RESIDUAL, fits.residual_m),
+            "used": fits.used.ravel(),
+            "points": fits.points.ravel().astype(np.int32),
+        }
+    )
+
+
+def unloaded_table(fits: SideFits) -> pa.Table:
+    """One row a station."""
+    return pa.table(
+        {
+            "side": _text([fits.side] * fits.s_m.size),
+            "station": np.arange(fits.s_m.size, dtype=np.int32),
+            "s_m": fits.s_m,
+            **_flat(POSITION, fits.unloaded_xyz_m),
+        }
+    )
+
+
+def _keys(fits: SideFits, item: str, count: int) -> dict[str, object]:
+    sets = fits.trigger_index.size
+    return {
+        "trigger_index": np.repeat(fits.trigger_index, count),
+        "side": _text([fits.side] * (sets * count)),
+        "timestamp_ns": np.repeat(fits.timestamp_ns, count),
+        item: np.tile(np.arange(count, dtype=np.int32), sets),
+    }
+
+
+def _flat(names: list[str] | tuple[str, ...], values: Floats) -> dict[str, Floats]:
+    """The last axis of ``values`` as one flat column a name."""
+    return {name: values[..., at].ravel() for at, name in enumerate(names)}
+
+
+def _text(values: list[str] | Words) -> pa.Array:
+    return pa.array(values, pa.string())

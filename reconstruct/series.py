@@ -1,0 +1,247 @@
+"""A flight's marker table → the fitted shape of both half wings at every trigger."""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.errors import ReconstructError, UsageError
+from reconstruct.fit import Fit, fit_frame
+from reconstruct.instants import InstantMarkers, InstantSettings, at_common_instant
+from reconstruct.tables import Bools, Floats, Ints, MarkerSeries, Words
+from reconstruct.wing import HalfWing, Wing
+from reconstruct.wing_file import FitSettings
+
+BLOCK_SETS = 20  # sets fitted one after the other with warm starts; fixed, so that workers do not change results
+_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class SideFits:
+    """One half wing's fits, dense over F sets, N + 1 nodes, M markers and k load stations; NaN where not fitted."""
+
+    side: str
+    trigger_index: Ints  # (F,)
+    timestamp_ns: Ints  # (F,) the set's common instant
+    s_m: Floats  # (N + 1,)
+    unloaded_xyz_m: Floats  # (N + 1, 3) body frame
+    xyz_m: Floats  # (F, N + 1, 3) body frame
+    sigma_xyz_m: Floats  # (F, N + 1, 3)
+    twist_rad: Floats  # (F, N + 1)
+    sigma_twist_rad: Floats  # (F, N + 1)
+    markers: MarkerSeries  # what was fitted: the wing's M markers in its order
+    residual_m: Floats  # (F, M, 3) measured minus fitted; NaN where not measured
+    used: Bools  # (F, M) False also for outliers
+    points: Ints  # (F, M) samples a marker's position at the common instant was made of
+    load_s_m: Floats  # (k,)
+    loads: Floats  # (F, k, 6) N and N·m, body frame
+    sigma_loads: Floats  # (F, k, 6)
+    net: Floats  # (F, 6) sum of the forces, and their moment with the moments about the root, body axes
+    sigma_net: Floats  # (F, 6)
+    chi2: Floats  # (F,)
+    dof: Floats  # (F,)
+    iterations: Ints  # (F,)
+    flags: Words  # (F,) str, empty when good: not_fitted, outlier (markers left out), row_time (taken as they are)
+    reason: Words  # (F,) str, why a set could not be fitted
+
+    @property
+    def converged(self) -> Bools:
+        """(F,) whether the set was fitted."""
+        return np.asarray(np.isfinite(self.xyz_m).all(axis=(1, 2)))
+
+
+@dataclass(frozen=True)
+class _Block:
+    side: str
+    rows: slice
+    xyz_m: Floats
+    cov_m2: Floats
+
+
+def fit_series(
+    markers: Mapping[str, MarkerSeries],
+    wing: Wing,
+    *,
+    instants: InstantSettings | None = None,
+    workers: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, SideFits]:
+    """Fit every set of both sides; ``progress`` is told the number of sets fitted since it was last called.
+
+    Markers are first brought to their set's common instant. Sets are fitted in blocks of BLOCK_SETS, each from the
+    last one's fit; blocks start from the unloaded wing, so the result does not depend on ``workers`` (default: one a
+    core this process may use). A set that cannot be fitted is NaN and flagged.
+    Raises UsageError when the markers are not those of ``wing`` or none was measured, ReconstructError when a worker
+    process dies.
+    """
+    _settings(wing)
+    measured = {}
+    for side, series in markers.items():
+        half = _half(wing, side)
+        series = _as_in(half, series)
+        measured[side] = (series, at_common_instant(series, instants))
+    if not any(moved.points.any() for _, moved in measured.values()):
+        raise UsageError("no marker was measured in any set; look at the flags column of the marker table")
+    blocks = [block for side, (_, moved) in measured.items() for block in _blocks(side, moved)]
+    fits: dict[str, list[Fit | None]] = {side: [None] * moved.points.shape[0] for side, (_, moved) in measured.items()}
+    for block, fitted in _fit_blocks(blocks, wing, workers or len(os.sched_getaffinity(0))):
+        fits[block.side][block.rows] = fitted
+        if progress is not None:
+            progress(len(fitted))
+    return {side: _gather(_half(wing, side), *measured[side], fits[side]) for side in measured}
+
+
+def _half(wing: Wing, side: str) -> HalfWing:
+    return wing.left if side == "left" else wing.right
+
+
+def _settings(wing: Wing) -> FitSettings:
+    if wing.fit is None:
+        raise UsageError(f"the wing {wing.name!r} has no [fit] section: say where its loads act (load_stations_m)")
+    return wing.fit
+
+
+def _as_in(half: HalfWing, series: MarkerSeries) -> MarkerSeries:
+    """``series`` with the wing's markers in the wing's order; those that the table lacks are not seen."""
+    unknown = sorted(set(series.marker.tolist()) - set(half.marker_ids.tolist()))
+    if unknown:
+        raise UsageError(
+            f"the marker table has marker {unknown[0]} on the {series.side} wing, the wing file does not "
+            f"(it has {half.marker_ids.size}); are both of the same aircraft?"
+        )
+    sets, markers = series.trigger_index.size, half.marker_ids.size
+    column = {int(marker): at for at, marker in enumerate(half.marker_ids)}
+    to = np.array([column[int(marker)] for marker in series.marker])
+    time = np.repeat(series.frame_timestamp_ns[:, None], markers, axis=1)
+    xyz, cov = np.full((sets, markers, 3), np.nan), np.full((sets, markers, 3, 3), np.nan)
+    flags = np.full((sets, markers), "not_seen", dtype=object)
+    time[:, to], xyz[:, to], cov[:, to], flags[:, to] = series.timestamp_ns, series.xyz_m, series.cov_m2, series.flags
+    return MarkerSeries(
+        series.side,
+        np.asarray(half.marker_ids, dtype=np.int64),
+        series.trigger_index,
+        series.frame_timestamp_ns,
+        time,
+        xyz,
+        cov,
+        flags,
+    )
+
+
+def _blocks(side: str, moved: InstantMarkers) -> list[_Block]:
+    sets = moved.points.shape[0]
+    parts = [slice(first, min(first + BLOCK_SETS, sets)) for first in range(0, sets, BLOCK_SETS)]
+    return [_Block(side, part, moved.xyz_m[part], moved.cov_m2[part]) for part in parts]
+
+
+def _fit_blocks(blocks: list[_Block], wing: Wing, workers: int) -> Iterator[tuple[_Block, list[Fit]]]:
+    """Blocks with their fits, in the order they get done."""
+    workers = min(workers, len(blocks))
+    if workers <= 1:
+        for block in blocks:
+            yield block, fit_block(_half(wing, block.side), _settings(wing), block.xyz_m, block.cov_m2)
+        return
+    spawn = multiprocessing.get_context("spawn")
+    with (
+        _one_blas_thread(),
+        ProcessPoolExecutor(workers, mp_context=spawn, initializer=_set_wing, initargs=(wing,)) as pool,
+    ):
+        pending = {pool.submit(_fit_block_here, block): block for block in blocks}
+        try:
+            for done in as_completed(pending):
+                yield pending[done], done.result()
+        except BrokenProcessPool as error:
+            raise ReconstructError("a worker process died while fitting (out of memory?); try --workers 1") from error
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """Processes started inside use one BLAS thread each: more would only compete for the same cores."""
+    before = {name: os.environ.get(name) for name in _BLAS_THREADS}
+    os.environ.update(dict.fromkeys(_BLAS_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+_wing: Wing | None = None  # of a worker process, set once when it starts
+
+
+def _set_wing(wing: Wing) -> None:
+    global _wing
+    _wing = wing
+
+
+def _fit_block_here(block: _Block) -> list[Fit]:
+    assert _wing is not None
+    return fit_block(_half(_wing, block.side), _settings(_wing), block.xyz_m, block.cov_m2)
+
+
+def fit_block(half: HalfWing, settings: FitSettings, xyz_m: Floats, cov_m2: Floats) -> list[Fit]:
+    """Fit consecutive sets, each from the last one's fit (one that did not converge starts nothing)."""
+    fits: list[Fit] = []
+    for xyz, cov in zip(xyz_m, cov_m2, strict=True):
+        fits.append(fit_frame(half, xyz, cov, settings, start=fits[-1] if fits else None))
+    return fits
+
+
+def _gather(half: HalfWing, series: MarkerSeries, moved: InstantMarkers, found: list[Fit | None]) -> SideFits:
+    fits = [fit for fit in found if fit is not None]
+    net, sigma_net = zip(*(_net(half, fit) for fit in fits), strict=True)
+    variance = np.array([np.diag(fit.load_covariance) for fit in fits])
+    used = np.array([fit.used for fit in fits])
+    alone = used & (moved.points == 1)
+    return SideFits(
+        side=series.side,
+        trigger_index=series.trigger_index,
+        timestamp_ns=series.frame_timestamp_ns,
+        s_m=half.node_s_m,
+        unloaded_xyz_m=half.rest_position_m,
+        xyz_m=np.array([fit.position_m for fit in fits]),
+        sigma_xyz_m=np.array([fit.sigma_position_m for fit in fits]),
+        twist_rad=np.array([fit.twist_rad for fit in fits]),
+        sigma_twist_rad=np.array([fit.sigma_twist_rad for fit in fits]),
+        markers=series,
+        residual_m=np.array([fit.residual_m for fit in fits]),
+        used=used,
+        points=moved.points,
+        load_s_m=fits[0].load_s_m,
+        loads=np.array([fit.loads for fit in fits]),
+        sigma_loads=np.sqrt(variance).reshape(len(fits), -1, 6),
+        net=np.array(net),
+        sigma_net=np.array(sigma_net),
+        chi2=np.array([fit.chi2 for fit in fits]),
+        dof=np.array([fit.dof for fit in fits]),
+        iterations=np.array([fit.iterations for fit in fits]),
+        flags=np.array([_flags(fit, lone) for fit, lone in zip(fits, alone.any(axis=1), strict=True)], dtype=object),
+        reason=np.array([fit.reason for fit in fits], dtype=object),
+    )
+
+
+def _flags(fit: Fit, alone: bool) -> str:
+    reasons = {"not_fitted": not fit.converged, "outlier": bool(fit.outlier.any()), "row_time": bool(alone)}
+    return ",".join(name for name, applies in reasons.items() if applies)
+
+
+def _net(half: HalfWing, fit: Fit) -> tuple[Floats, Floats]:
+    """Sum of the loads and of their moments about the root, (6,), and its sigma (6,)."""
+    nodes = [half.node_at(station) for station in fit.load_s_m]
+    sums = np.zeros((6, len(nodes), 6))
+    for at, (x, y, z) in enumerate(fit.position_m[nodes] - fit.position_m[0]):
+        sums[:, at] = np.eye(6)
+        sums[3:, at, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    flat = sums.reshape(6, -1)
+    return flat @ fit.loads.ravel(), np.sqrt(np.einsum("ia,ab,ib->i", flat, fit.load_covariance, flat))

@@ -1,0 +1,243 @@
+"""Tables of a result folder: Parquet (and CSV) on disk ⇄ dense arrays, one set of arrays a side."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from capture.errors import UsageError
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+Words = npt.NDArray[np.object_]
+
+SIDES = ("left", "right")
+MARKERS = "markers.parquet"
+SHAPE = "shape.parquet"
+FRAMES = "frames.parquet"
+LOADS = "loads.parquet"
+RESIDUALS = "residuals.parquet"
+UNLOADED = "unloaded.parquet"
+
+POSITION = ("x_m", "y_m", "z_m")
+COVARIANCE = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
+SIGMA = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
+TIP_COLUMNS = ("tip_dx_m", "tip_dy_m", "tip_dz_m", "tip_twist_deg")
+RESIDUAL = ("residual_x_m", "residual_y_m", "residual_z_m")
+LOAD_COLUMNS = ("fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
+NET_COLUMNS = tuple(f"net_{name}" for name in LOAD_COLUMNS)
+_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True)
+class MarkerSeries:
+    """One side's markers, dense over F sets and M markers; what was not measured is NaN."""
+
+    side: str
+    marker: Ints  # (M,) identities, ascending
+    trigger_index: Ints  # (F,) ascending
+    frame_timestamp_ns: Ints  # (F,) the set's common instant
+    timestamp_ns: Ints  # (F, M) the marker's own instant
+    xyz_m: Floats  # (F, M, 3) body frame
+    cov_m2: Floats  # (F, M, 3, 3); NaN where the table has none
+    flags: Words  # (F, M) str, empty when good
+
+    @property
+    def seen(self) -> Bools:
+        """(F, M) whether the marker has a position."""
+        return np.asarray(np.isfinite(self.xyz_m).all(axis=-1))
+
+
+@dataclass(frozen=True)
+class ShapeSeries:
+    """One side's shape, dense over F sets and S stations; a set that could not be fitted is NaN."""
+
+    side: str
+    trigger_index: Ints  # (F,) ascending
+    timestamp_ns: Ints  # (F,)
+    s_m: Floats  # (S,) arc length from the root
+    xyz_m: Floats  # (F, S, 3) body frame
+    twist_deg: Floats  # (F, S) nose-up, against the unloaded wing
+    sigma_xyz_m: Floats  # (F, S, 3); NaN where the table has none
+    sigma_twist_deg: Floats  # (F, S)
+    flags: Words  # (F,) str, empty when good
+
+
+def read_table(path: Path, required: Sequence[str]) -> pa.Table:
+    """The table at ``path``, checked to be Parquet, to have rows and the ``required`` columns.
+
+    Raises UsageError when it is missing, unreadable, empty or lacks a column.
+    """
+    if not path.is_file():
+        raise UsageError(f"{path}: no such table")
+    try:
+        table = pyarrow.parquet.read_table(path, memory_map=False)
+    except (pa.ArrowException, OSError) as error:
+        raise UsageError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]})") from error
+    check_columns(table, required, str(path))
+    return table
+
+
+def check_columns(table: pa.Table, required: Sequence[str], name: str) -> None:
+    """Raises UsageError when ``table`` lacks a ``required`` column or has no rows; ``name`` is used in the message."""
+    missing = [column for column in required if column not in table.column_names]
+    if missing:
+        raise UsageError(f"{name}: lacks the columns {', '.join(missing)} (see docs/reference/formats.md)")
+    if table.num_rows == 0:
+        raise UsageError(f"{name}: has no rows")
+
+
+def marker_series(table: pa.Table, name: str, *, covariance: bool = True) -> dict[str, MarkerSeries]:
+    """The marker table as dense arrays by side, sides without rows left out.
+
+    ``covariance`` False: the covariances and the common instant may be missing (a reference). Raises UsageError when
+    columns are missing, a side is neither left nor right, a marker occurs twice in a set, or the markers of one
+    set do not agree on their common instant.
+    """
+    required = ("trigger_index", "side", "marker", "timestamp_ns", *POSITION)
+    check_columns(table, (*required, "frame_timestamp_ns", *COVARIANCE) if covariance else required, name)
+    own_times = "frame_timestamp_ns" not in table.column_names
+    rows = {
+        "marker": _ints(table, "marker", name),
+        "time": _ints(table, "timestamp_ns", name),
+        "frame_time": _ints(table, "timestamp_ns" if own_times else "frame_timestamp_ns", name),
+        "xyz": _stack(table, POSITION, name),
+        "cov": _stack(table, COVARIANCE, name),
+        "flags": _words(table, "flags"),
+    }
+    series = {}
+    for side, pick, frame_of, triggers in _by_side(table, name):
+        own = {key: values[pick] for key, values in rows.items()}
+        series[side] = _dense_markers(side, triggers, frame_of, own, name, check_instant=not own_times)
+    return series
+
+
+def shape_series(table: pa.Table, name: str) -> dict[str, ShapeSeries]:
+    """The shape table as dense arrays by side, sides without rows left out.
+
+    Sigmas and flags may be missing (a reference). Raises UsageError when columns are missing, a station is missing or
+    occurs twice in a set, or the arc length of a station or the time of a set is not the same in all of its rows.
+    """
+    check_columns(table, ("trigger_index", "side", "timestamp_ns", "station", "s_m", *POSITION, "twist_deg"), name)
+    station, time = _ints(table, "station", name), _ints(table, "timestamp_ns", name)
+    s_m, xyz = _stack(table, ("s_m",), name)[:, 0], _stack(table, POSITION, name)
+    sigmas = _stack(table, (*SIGMA, "sigma_twist_deg"), name)
+    twist, flags = _stack(table, ("twist_deg",), name)[:, 0], _words(table, "flags")
+    series = {}
+    for side, pick, frame_of, triggers in _by_side(table, name):
+        stations, station_of = np.unique(station[pick], return_inverse=True)
+        shape = (triggers.size, stations.size)
+        order = _positions(frame_of, station_of, shape, f"{name}: {side} wing", "station")
+        if order.size != triggers.size * stations.size:
+            raise UsageError(f"{name}: the {side} wing has sets without all of its {stations.size} stations")
+        row = pick[np.argsort(order)].reshape(shape)
+        if np.ptp(s_m[row], axis=0).max() > 1e-9 or np.any(np.diff(s_m[row[0]]) <= 0):
+            raise UsageError(f"{name}: {side} wing: s_m must grow with the station and be the same in every set")
+        if np.any(np.ptp(time[row], axis=1) != 0):
+            raise UsageError(f"{name}: {side} wing: the stations of a set must share one timestamp_ns")
+        series[side] = ShapeSeries(
+            side,
+            triggers,
+            time[row[:, 0]],
+            s_m[row[0]],
+            xyz[row],
+            twist[row],
+            sigmas[row][..., :3],
+            sigmas[row][..., 3],
+            flags[row[:, 0]],
+        )
+    return series
+
+
+def rms(values: Floats, axis: int) -> Floats:
+    """Root mean square of the finite values along ``axis``, NaN where there are none."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    total = np.sum(np.where(known, values, 0.0) ** 2, axis=axis)
+    return np.asarray(np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan)))
+
+
+def write_csv(table: pa.Table, path: Path) -> None:
+    """``table`` as comma-separated text with a header line; NaN is written as ``nan``."""
+    pyarrow.csv.write_csv(table, path)
+
+
+def _by_side(table: pa.Table, name: str) -> list[tuple[str, Ints, Ints, Ints]]:
+    """(side, its row numbers, the set of each of these rows, the sets' trigger indices) for each side present."""
+    side = _words(table, "side")
+    strange = sorted({str(value) for value in np.unique(side)} - set(SIDES))
+    if strange:
+        raise UsageError(f"{name}: side is {strange[0]!r}, not left or right")
+    trigger = _ints(table, "trigger_index", name)
+    found = []
+    for which in SIDES:
+        pick = np.flatnonzero(side == which)
+        if pick.size:
+            triggers, frame_of = np.unique(trigger[pick], return_inverse=True)
+            found.append((which, pick, frame_of.astype(np.int64), triggers))
+    return found
+
+
+def _dense_markers(
+    side: str, triggers: Ints, frame_of: Ints, rows: Mapping[str, Any], name: str, *, check_instant: bool
+) -> MarkerSeries:
+    markers, marker_of = np.unique(rows["marker"], return_inverse=True)
+    shape = (triggers.size, markers.size)
+    _positions(frame_of, marker_of, shape, f"{name}: {side} wing", "marker")
+    last = np.full(triggers.size, np.iinfo(np.int64).min)
+    np.maximum.at(last, frame_of, rows["frame_time"])
+    if check_instant and np.any(rows["frame_time"] != last[frame_of]):
+        raise UsageError(f"{name}: {side} wing: the markers of a set must share one frame_timestamp_ns")
+    time = np.repeat(last[:, None], markers.size, axis=1)
+    xyz = np.full((*shape, 3), np.nan)
+    cov = np.full((*shape, 3, 3), np.nan)
+    flags = np.full(shape, "not_seen", dtype=object)
+    time[frame_of, marker_of] = rows["time"]
+    xyz[frame_of, marker_of] = rows["xyz"]
+    flags[frame_of, marker_of] = rows["flags"]
+    for column, (i, j) in enumerate(_TRIANGLE):
+        cov[frame_of, marker_of, i, j] = cov[frame_of, marker_of, j, i] = rows["cov"][:, column]
+    xyz[~np.isfinite(xyz).all(axis=-1)] = np.nan
+    return MarkerSeries(side, markers, triggers, last, time, xyz, cov, flags)
+
+
+def _positions(frame_of: Ints, item_of: Ints, shape: tuple[int, int], name: str, what: str) -> Ints:
+    """Flat positions of the rows in a dense array of ``shape``; raises UsageError when two rows share one."""
+    order = frame_of * shape[1] + item_of
+    if np.unique(order).size != order.size:
+        raise UsageError(f"{name}: a {what} occurs twice in one set")
+    return np.asarray(order, dtype=np.int64)
+
+
+def _ints(table: pa.Table, column: str, name: str) -> Ints:
+    values = table.column(column)
+    if not pa.types.is_integer(values.type) or values.null_count:
+        raise UsageError(f"{name}: the column {column} must be whole numbers without gaps")
+    return np.asarray(values.to_numpy(), dtype=np.int64)
+
+
+def _stack(table: pa.Table, names: Sequence[str], name: str) -> Floats:
+    """(rows, len(names)) numbers, NaN where the table has no such column."""
+    stacked = np.full((table.num_rows, len(names)), np.nan)
+    for at, column in enumerate(names):
+        if column not in table.column_names:
+            continue
+        values = table.column(column)
+        if not (pa.types.is_floating(values.type) or pa.types.is_integer(values.type)):
+            raise UsageError(f"{name}: the column {column} must be numbers")
+        stacked[:, at] = values.to_numpy(zero_copy_only=False)
+    return stacked
+
+
+def _words(table: pa.Table, column: str) -> Words:
+    if column not in table.column_names:
+        return np.full(table.num_rows, "", dtype=object)
+    values = table.column(column).cast(pa.string()).fill_null("")
+    return np.asarray(values.to_numpy(zero_copy_only=False), dtype=object)
