@@ -4,6 +4,7 @@ Equation numbers are those of docs/explanation/beam.md. The loads found are net:
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -18,6 +19,8 @@ _ITERATIONS = 50
 _LARGEST_TURN_RAD = 0.3  # of an element in one step
 _SETTLED_SIGMA = 1e-3  # the last step in units of the loads' posterior sigma
 _SETTLED_TURN_RAD = 1e-6  # what is missing to equilibrium in any element
+_SMALLEST_MODE = 1e-5  # of the largest mode's variance
+_ENERGY_J = 1e-3  # elastic energy of the strains that point loads at a few stations may leave unexplained
 _ROUNDS = 5  # changes of which markers are in
 _MEDIAN_DISTANCE = 1.538  # median length of a standard normal 3-vector
 
@@ -30,6 +33,7 @@ class Fit:
     reason: str
     iterations: int
     load_s_m: Array  # (k,) stations of the loads
+    unknowns: Array  # what was solved for, in units of its prior sigma: starts the next fit
     loads: Array  # (k, 6) net force (N) and moment (N·m), body frame
     load_covariance: Array  # (6k, 6k)
     strain: Array  # (N, 4) extension, twist, out-of-plane, in-plane
@@ -50,11 +54,16 @@ class Fit:
 class _Problem:
     half: HalfWing
     load_nodes: Index
+    modes: Array | None  # (4N, m) strains of a unit of each unknown where loads act at every node
     load_sigma: Array  # (6k,) prior; the unknowns are the loads in units of it
     xyz: Array  # (M, 3), zero where not measured
     whiten: Array  # (M, 3, 3) inverse Cholesky factors, zero where not measured
     seen: Mask  # (M,) bool
     outlier_sigma: float
+
+    @property
+    def unknowns(self) -> int:
+        return len(self.load_sigma) if self.modes is None else self.modes.shape[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +98,7 @@ def fit_frame(
     settings: FitSettings,
     start: Fit | None = None,
 ) -> Fit:
-    """Fit net loads at a few stations, and with them the shape, to one instant's markers (eqs. 16 to 21).
+    """Fit net loads at a few stations, and with them the shape, to one instant's markers (eqs. 16 to 24).
 
     Args:
         half: the half wing.
@@ -108,11 +117,11 @@ def fit_frame(
     if count < FEWEST_MARKERS:
         return _failed(half, stations, 0, f"{count} of {len(problem.seen)} markers measured, {FEWEST_MARKERS} needed")
     state = None
-    if start is not None and start.converged and start.loads.shape == (len(stations), 6):
-        state = _iterate(problem, start.strain, start.loads.ravel() / problem.load_sigma)
+    if start is not None and start.converged and len(start.unknowns) == problem.unknowns:
+        state = _iterate(problem, start.strain, start.unknowns)
     if state is None or not state.settled:
         before = state.iterations if state is not None else 0
-        state = _iterate(problem, np.zeros((half.beam.elements, 4)), np.zeros(6 * len(stations)))
+        state = _iterate(problem, np.zeros((half.beam.elements, 4)), np.zeros(problem.unknowns))
         if not state.settled:
             return _failed(half, stations, before + state.iterations, f"did not settle in {_ITERATIONS} iterations")
     return _result(problem, state, stations)
@@ -127,16 +136,43 @@ def _pose(half: HalfWing, xyz: Array, cov: Array, settings: FitSettings) -> _Pro
     seen = np.logical_and(seen, np.linalg.eigvalsh(safe)[:, 0] > 0)
     full = np.where(seen[:, None, None], safe, np.eye(3)) + settings.marker_model_sigma_m**2 * np.eye(3)
     whiten = np.linalg.inv(np.linalg.cholesky(full)) * seen[:, None, None]
-    sigma = np.array([*settings.force_sigma_n, *settings.moment_sigma_nm])
+    sigma = np.repeat([settings.force_sigma_n, settings.moment_sigma_nm], 3)
     return _Problem(
         half=half,
         load_nodes=np.array([half.node_at(station) for station in settings.load_stations_m]),
+        modes=_strain_modes(half, settings) if settings.loads == "everywhere" else None,
         load_sigma=np.tile(sigma, len(settings.load_stations_m)),
         xyz=np.where(seen[:, None], xyz, 0.0),
         whiten=whiten,
         seen=seen,
         outlier_sigma=settings.outlier_sigma,
     )
+
+
+@lru_cache(maxsize=16)
+def _strain_modes(half: HalfWing, settings: FitSettings) -> Array:
+    """The strains' prior as independent modes of unit variance (eqs. 22, 23): (4N, m).
+
+    Along the span a Matérn 5/2 process, as moments under distributed loads are smooth; times a taper, as a free end
+    carries no moment (a tenth is left there for loads on the tip).
+    """
+    stiffness, span = half.beam.stiffness, half.node_s_m[-1]
+    x = (half.node_s_m[:-1] + half.node_s_m[1:]) / (2 * span)
+    apart = np.sqrt(5) * np.abs(x[:, None] - x[None, :]) / settings.correlation
+    variance, shapes = np.linalg.eigh((1 + apart + apart**2 / 3) * np.exp(-apart))
+    kept = variance > _SMALLEST_MODE * variance[-1]
+    shapes = shapes[:, kept] * np.sqrt(variance[kept])
+    to_free_end = 1 - 0.9 * x
+    twist, out = np.radians([settings.twist_sigma_deg, settings.bend_out_sigma_deg]) / span
+    if settings.bend_in_sigma_deg is None:
+        into = out * np.sqrt(stiffness[:, 2, 2] / stiffness[:, 3, 3])
+    else:
+        into = np.radians(settings.bend_in_sigma_deg) / span
+    sigma = (np.full(len(x), settings.extension_sigma), twist * to_free_end, out * to_free_end, into * to_free_end)
+    modes = np.zeros((len(x), 4, 4, shapes.shape[1]))
+    for i in range(4):
+        modes[:, i, i] = sigma[i][:, None] * shapes
+    return modes.reshape(4 * len(x), -1)
 
 
 def _iterate(problem: _Problem, strain: Array, theta: Array) -> _State:
@@ -155,7 +191,10 @@ def _iterate(problem: _Problem, strain: Array, theta: Array) -> _State:
         A = (root[:, :, None] * linear.jacobian).reshape(-1, len(theta))
         information = A.T @ A
         normal = information + np.eye(len(theta))
-        factor = np.linalg.inv(np.linalg.cholesky(normal))
+        try:
+            factor = np.linalg.inv(np.linalg.cholesky(normal))
+        except np.linalg.LinAlgError:
+            break
         change = -factor.T @ (factor @ (A.T @ (root * linear.predicted).ravel() + theta))
         step = linear.correction + linear.response @ change
         turn = float(np.abs(step * length).max())
@@ -171,16 +210,19 @@ def _iterate(problem: _Problem, strain: Array, theta: Array) -> _State:
         damping = min(1.0, _LARGEST_TURN_RAD / max(turn, 1e-300))
         strain = strain + damping * step.reshape(-1, 4)
         theta = theta + damping * change
-    return _State(False, iteration, theta, linear, weight, factor, information)
+    return _State(False, iteration, theta, linear, weight, information, information)
 
 
 def _linearise(problem: _Problem, strain: Array, theta: Array) -> _Linear:
     half, beam = problem.half, problem.half.beam
     shape = shape_of(beam, strain)
-    unit = _unit_forces(problem, shape) * problem.load_sigma
-    Q, H = generalised_force_and_tangent(beam, shape, _loads(problem, theta))
-    K = beam.stiffness_matrix
-    both: Array = np.linalg.solve(K - H, np.column_stack([unit, Q - K @ strain.ravel()])).astype(np.float64)
+    if problem.modes is not None:
+        both = np.column_stack([problem.modes, np.zeros(4 * beam.elements)])
+    else:
+        unit = _unit_forces(problem, shape) * problem.load_sigma
+        Q, H = generalised_force_and_tangent(beam, shape, _loads(problem, theta))
+        K = beam.stiffness_matrix
+        both = np.linalg.solve(K - H, np.column_stack([unit, Q - K @ strain.ravel()]))
     spin, slide = _node_motion(shape, both)
     node, point = half.marker_node, _marker_points(half, shape)
     motion = problem.whiten @ (slide[node] + hat(point).transpose(0, 2, 1) @ spin[node])
@@ -203,7 +245,7 @@ def _scale(problem: _Problem, distance: Array) -> float:
 
 def _weight(problem: _Problem, distance: Array) -> Array:
     limit = problem.outlier_sigma * _scale(problem, distance)
-    return np.where(problem.seen, np.minimum(1.0, (limit / np.maximum(distance, 1e-300)) ** 2), 0.0)
+    return np.where(problem.seen, (limit / np.maximum(distance, limit)) ** 2, 0.0)
 
 
 def _verdict(problem: _Problem, distance: Array) -> Array:
@@ -249,6 +291,7 @@ def _result(problem: _Problem, state: _State, stations: Array) -> Fit:
     spin, slide = state.linear.spin @ state.factor.T, state.linear.slide @ state.factor.T
     moves = slide + hat(shape.position_m).transpose(0, 2, 1) @ spin
     twists = (twist_gradient(half, shape.R_body_section)[:, None, :] @ spin)[:, 0, :]
+    loads, load_covariance = _station_loads(problem, state)
     used = state.weight > 0
     measured = problem.seen[:, None]
     return Fit(
@@ -256,8 +299,9 @@ def _result(problem: _Problem, state: _State, stations: Array) -> Fit:
         reason="",
         iterations=state.iterations,
         load_s_m=stations,
-        loads=(problem.load_sigma * state.theta).reshape(-1, 6),
-        load_covariance=np.outer(problem.load_sigma, problem.load_sigma) * covariance,
+        unknowns=state.theta,
+        loads=loads,
+        load_covariance=load_covariance,
         strain=shape.strain,
         position_m=shape.position_m,
         R_body_section=shape.R_body_section,
@@ -273,6 +317,26 @@ def _result(problem: _Problem, state: _State, stations: Array) -> Fit:
     )
 
 
+def _station_loads(problem: _Problem, state: _State) -> tuple[Array, Array]:
+    """Loads (k, 6) at the stations and their covariance (6k, 6k).
+
+    Where loads act at every node, those point loads at the stations whose strains come closest, in elastic energy, to
+    the strains found (eq. 24). What strains cannot tell keeps the prior's sigma.
+    """
+    sigma = problem.load_sigma
+    if problem.modes is None:
+        covariance = state.factor.T @ state.factor
+        return (sigma * state.theta).reshape(-1, 6), np.outer(sigma, sigma) * covariance
+    beam, shape = problem.half.beam, state.linear.shape
+    unit = _unit_forces(problem, shape)
+    flexible = np.linalg.solve(beam.stiffness * beam.length_m[:, None, None], unit.reshape(beam.elements, 4, -1))
+    normal = unit.T @ flexible.reshape(unit.shape) / _ENERGY_J + np.diag(sigma**-2.0)
+    undetermined = np.linalg.inv(normal)
+    gain = undetermined @ unit.T / _ENERGY_J
+    spread = gain @ problem.modes @ state.factor.T
+    return (gain @ shape.strain.ravel()).reshape(-1, 6), spread @ spread.T + undetermined
+
+
 def _failed(half: HalfWing, stations: Array, iterations: int, reason: str) -> Fit:
     def nan(*shape: int) -> Array:
         return np.full(shape, np.nan)
@@ -284,6 +348,7 @@ def _failed(half: HalfWing, stations: Array, iterations: int, reason: str) -> Fi
         reason=reason,
         iterations=iterations,
         load_s_m=stations,
+        unknowns=np.empty(0),
         loads=nan(k, 6),
         load_covariance=nan(6 * k, 6 * k),
         strain=nan(n, 4),

@@ -122,11 +122,21 @@ class StiffnessSigma(_Strict):
 
 
 class FitSettings(_Strict):
-    """What the inverse may assume: where loads act, how large they may be, how good the markers' model is."""
+    """What the inverse may assume: where loads act, what they may do to the wing, how good the markers' model is.
 
-    load_stations_m: Annotated[tuple[Positive, ...], Field(min_length=1)]
-    force_sigma_n: tuple[Positive, Positive, Positive] = (20.0, 20.0, 20.0)  # prior, body x, y, z, at each station
-    moment_sigma_nm: tuple[Positive, Positive, Positive] = (10.0, 10.0, 10.0)
+    The prior of loads at every node is stated by the strains they cause: one sigma of the angle by which the tip turns
+    when that strain is the same all along.
+    """
+
+    loads: Literal["everywhere", "stations"] = "everywhere"  # at every node, or only at the stations (the paper's way)
+    load_stations_m: Annotated[tuple[Positive, ...], Field(min_length=1)]  # where loads act, or are reported
+    twist_sigma_deg: Positive = 4.0
+    bend_out_sigma_deg: Positive = 40.0
+    bend_in_sigma_deg: Positive | None = None  # None: out of plane's, times √(EI_out / EI_in)
+    extension_sigma: Positive = 5e-5
+    correlation: Positive = 1.3  # in half spans: strains much closer than this are alike
+    force_sigma_n: Positive = 30.0  # of each component at each station
+    moment_sigma_nm: Positive = 5.0
     marker_model_sigma_m: NotNegative = 0.0005  # added to every marker's covariance
     outlier_sigma: Positive = 4.6  # a marker farther off than this (χ² of 3, p = 1e-4) is left out
 
