@@ -38,8 +38,10 @@ class DetectSettings:
     """minor over major axis; a light seen at a slant is not round"""
     reflection_flux: float = 0.35
     """a spot with less than this part of a neighbour's light is taken for its reflection …"""
-    reflection_reach_px: float = 12.0
-    """… if it is closer than this, and the two spots' radii"""
+    reflection_reach_px: float = 6.0
+    """… if it is closer than this and, …"""
+    reflection_reach_radii: float = 3.0
+    """… on top, this times the two spots' radii: the shine of a light is its own stand-off below the surface"""
     paper_threshold: int = 60
     """of the paper's method, absolute"""
     paper_circularity: float = 0.8
@@ -376,7 +378,7 @@ def _without_reflections(
     size = np.hypot(parameters[:, RADIUS], 1.5 * parameters[:, BLUR])
     flux = parameters[:, AMPLITUDE] * size**2
     apart = np.hypot(*(parameters[:, None, :2] - parameters[None, :, :2]).transpose(2, 0, 1))
-    close = apart < settings.reflection_reach_px + size[:, None] + size[None, :]
+    close = apart < settings.reflection_reach_px + settings.reflection_reach_radii * (size[:, None] + size[None, :])
     shine = (close & (flux[:, None] < settings.reflection_flux * flux[None, :])).any(axis=1)
     for k in keep[shine]:
         scene.reject(blobs[k].u, blobs[k].v, "reflection")

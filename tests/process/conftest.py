@@ -74,8 +74,8 @@ class World:
         """(18, 3) lights of a wing bent to a circle (arc length kept), twisted and swept in proportion to s²."""
         stations = np.repeat(self.rig.markers.pairs_station_m, 2)
         chord = np.tile(self.rig.markers.chord_m, len(stations) // 2)
-        angle = curvature_per_m * stations
-        bend = curvature_per_m if abs(curvature_per_m) > 1e-9 else 1e-9
+        bend = curvature_per_m if abs(curvature_per_m) > 1e-6 else 1e-6
+        angle = bend * stations
         twist = twist_rad * stations / stations[-1]
         y = np.sin(angle) / bend
         z = (1 - np.cos(angle)) / bend

@@ -1,0 +1,363 @@
+"""Spots of a pair's two images to the wing's numbered markers: which belong together, and which light they are.
+
+Candidates are all pairs of spots that satisfy the epipolar condition. They become markers by an assignment to
+predicted places with a "none" class. Without a previous frame, the places are those of a wing of the layout's arc
+lengths bent to several degrees; whatever fits best is bent on, as polynomials in arc length, to what was matched, and
+matched again more tightly. With one, they are the previous places, moved on.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from process.camera_model import MarkerLayout, RigSide
+from process.detect import Detections
+from process.triangulate import Rays, epipolar_distance_px, rays, rectified_pixels, triangulate_rays
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+T = TypeVar("T", bound=np.generic)
+
+UNSEEN = -1
+_TIP_SLOPES_RAD = np.linspace(-0.5, 1.2, 18)
+_CONFLICT_ROUNDS = 40
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """How spots are matched. Standard deviations are of the predicted places, along the wing's directions."""
+
+    method: Literal["default", "rows"] = "default"
+    epipolar_allowance_px: float = 0.5
+    """calibration's part of the epipolar distance, one sigma"""
+    epipolar_gate: float = 3.0
+    """sigmas"""
+    none_cost: float = 16.0
+    """squared Mahalanobis distance from which "not seen" is the better explanation"""
+    least_margin: float = 6.0
+    """a runner-up closer than this, in squared Mahalanobis distance, makes a marker ``ambiguous``"""
+    start_sigma_m: tuple[float, float, float] = (0.06, 0.035, 0.20)
+    """span, chord and normal, without a previous frame"""
+    track_sigma_m: tuple[float, float, float] = (0.015, 0.015, 0.05)
+    """with one; the normal one also takes the motion of a frame without known velocity"""
+    final_sigma_m: tuple[float, float, float] = (0.012, 0.012, 0.018)
+    """after the wing has been bent to what was matched"""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Where the markers were: what the next frame's matching starts from."""
+
+    trigger_index: int
+    places_m: Array
+    """(M, 3) body frame; those not seen are interpolated"""
+    velocity_m: Array | None
+    """(M, 3) metres a trigger; None after a single frame"""
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """The M markers of a layout in one frame set."""
+
+    spot0: Indices
+    """(M,) index into cam0's detections, ``UNSEEN`` where the marker is not seen"""
+    spot1: Indices
+    margin: Array
+    """(M,) squared Mahalanobis distance to the runner-up, which may be "not seen"; NaN where not seen"""
+    ambiguous: NDArray[np.bool_]
+    track: Track | None
+    """for the next frame; None if there was too little to follow"""
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(M,)"""
+        return np.asarray(self.spot0 != UNSEEN)
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    spot0: Indices
+    spot1: Indices
+    xyz_m: Array
+    epipolar_d2: Array
+
+
+def match(
+    side_name: str,
+    side: RigSide,
+    layout: MarkerLayout,
+    detections: tuple[Detections, Detections],
+    trigger_index: int,
+    track: Track | None = None,
+    settings: MatchSettings | None = None,
+) -> Matches:
+    """Match and identify the spots of a frame set.
+
+    ``track`` is the previous frame's; without it, or when following it fails, the matching starts afresh. ``rows`` is
+    the paper's way: spots of both images sorted by rectified row, identity by distance; it needs every marker seen
+    and nothing else.
+    """
+    settings = settings or MatchSettings()
+    pair = side.pair
+    rays0 = rays(pair.cam0, detections[0].pixels, detections[0].covariance_px2)
+    rays1 = rays(pair.cam1, detections[1].pixels, detections[1].covariance_px2)
+    if settings.method == "rows":
+        return _match_by_rows(side, layout, rays0, rays1)
+    candidates = _candidates(side_name, side, layout, detections, rays0, rays1, settings)
+    wing = _Wing(side_name, layout)
+    result = None if track is None else _follow(wing, candidates, track, trigger_index, settings)
+    if result is None or _leaves_spots(result[0], detections):
+        fresh = _start(wing, candidates, settings)
+        if result is None or _total(fresh[0], fresh[2], settings) < _total(result[0], result[2], settings):
+            result = fresh
+    chosen, places, cost = result
+    margin = _margins(candidates, chosen, cost, settings.none_cost)
+    seen = chosen != UNSEEN
+    ambiguous = seen & ~(margin >= settings.least_margin)
+    next_track = _next_track(candidates, chosen, places, trigger_index, track)
+    return Matches(
+        np.where(seen, _picked(candidates.spot0, chosen), UNSEEN),
+        np.where(seen, _picked(candidates.spot1, chosen), UNSEEN),
+        margin,
+        ambiguous,
+        next_track,
+    )
+
+
+class _Wing:
+    """A half wing's markers in the section's coordinates, and the directions span, chord, normal."""
+
+    def __init__(self, side_name: str, layout: MarkerLayout) -> None:
+        self.outboard = 1.0 if side_name == "right" else -1.0
+        pairs = np.array(layout.pairs_station_m, dtype=np.float64)
+        self.station_m = np.repeat(pairs, 2)
+        self.chord_m = np.tile(np.array(layout.chord_m, dtype=np.float64), len(pairs))
+        self.height_m = layout.height_m
+        self.span_m = float(pairs[-1])
+        self.count = len(self.station_m)
+        # columns of what the wing can be bent by: s … s⁴ along the axis, and c, c s, c s² for its sections
+        s, c = self.station_m / self.span_m, self.chord_m / 0.1
+        self.basis = np.stack([s, s**2, s**3, s**4, c, c * s, c * s**2], axis=1)
+
+    def bent(self, tip_slope_rad: float) -> Array:
+        """(M, 3) markers of a wing whose slope grows to ``tip_slope_rad`` as a cantilever's under an even load."""
+        fine = np.linspace(0.0, self.span_m, 200)
+        slope = tip_slope_rad * (1.0 - (1.0 - fine / self.span_m) ** 3)
+        step = np.diff(fine, prepend=0.0)
+        y = np.interp(self.station_m, fine, np.cumsum(np.cos(slope) * step))
+        z = np.interp(self.station_m, fine, np.cumsum(np.sin(slope) * step))
+        at = np.interp(self.station_m, fine, slope)
+        y, z = y - self.height_m * np.sin(at), z + self.height_m * np.cos(at)
+        return np.stack([-self.chord_m, self.outboard * y, z], axis=1)
+
+    def directions(self, places_m: Array) -> Array:
+        """(M, 3, 3) rows span, chord, normal of a wing whose markers are at ``places_m``."""
+        middles = (places_m[0::2] + places_m[1::2]) / 2.0
+        along = np.gradient(middles, axis=0)
+        span = np.repeat(along / np.linalg.norm(along, axis=1)[:, None], 2, axis=0)
+        chord = np.broadcast_to(np.array([-1.0, 0.0, 0.0]), span.shape)
+        chord = chord - np.sum(chord * span, axis=1)[:, None] * span
+        chord = chord / np.linalg.norm(chord, axis=1)[:, None]
+        return np.stack([span, chord, np.cross(span, chord)], axis=1)
+
+    def bend_to(self, places_m: Array, measured_m: Array, seen: NDArray[np.bool_]) -> Array:
+        """``places_m`` moved smoothly to ``measured_m`` where ``seen``; a weak pull keeps it from running off."""
+        pull = np.array([0.02, 0.03, 0.05, 0.08, 0.05, 0.05, 0.08])
+        A = np.concatenate([self.basis[seen], np.diag(pull)])
+        b = np.concatenate([(measured_m - places_m)[seen], np.zeros((len(pull), 3))])
+        return np.asarray(places_m + self.basis @ np.linalg.lstsq(A, b, rcond=None)[0])
+
+
+_Result = tuple[Indices, Array, Array]  # chosen candidate, predicted places, cost matrix (markers × candidates)
+
+
+def _candidates(
+    side_name: str,
+    side: RigSide,
+    layout: MarkerLayout,
+    detections: tuple[Detections, Detections],
+    rays0: Rays,
+    rays1: Rays,
+    settings: MatchSettings,
+) -> _Candidates:
+    """Pairs of spots on each other's epipolar lines that meet in front of the cameras, where a wing can be."""
+    distance_px = epipolar_distance_px(side.pair, rays0.xy[:, None, :], rays1.xy[None, :, :])
+    noise0, noise1 = (np.trace(d.covariance_px2, axis1=1, axis2=2) / 2.0 for d in detections)
+    variance = (noise0[:, None] + noise1[None, :]) / 2.0 + settings.epipolar_allowance_px**2
+    d2 = distance_px**2 / variance
+    spot0, spot1 = np.nonzero(d2 < settings.epipolar_gate**2)
+    points = triangulate_rays(side, rays0[spot0], rays1[spot1])
+    outboard_m = points.xyz_m[:, 1] * (1.0 if side_name == "right" else -1.0)
+    reach_m = 1.1 * layout.pairs_station_m[-1] + 0.2
+    with np.errstate(invalid="ignore"):
+        inside = (np.linalg.norm(points.xyz_m, axis=1) < reach_m) & (outboard_m > -0.1)
+    return _Candidates(spot0[inside], spot1[inside], points.xyz_m[inside], d2[spot0, spot1][inside])
+
+
+def _start(wing: _Wing, candidates: _Candidates, settings: MatchSettings) -> _Result:
+    """The best of several bends, each assigned loosely; the three best are refined."""
+    tried = []
+    for slope in _TIP_SLOPES_RAD:
+        places = wing.bent(float(slope))
+        chosen, cost = _assigned(wing, candidates, places, settings.start_sigma_m, settings.none_cost)
+        tried.append((_total(chosen, cost, settings), places, chosen))
+    tried.sort(key=lambda trial: trial[0])
+    refined = []
+    for _, places, chosen in tried[:3]:
+        result = _refined(wing, candidates, places, chosen, (settings.start_sigma_m, settings.track_sigma_m), settings)
+        refined.append((_total(result[0], result[2], settings), result))
+    return min(refined, key=lambda trial: trial[0])[1]
+
+
+def _follow(
+    wing: _Wing, candidates: _Candidates, track: Track, trigger_index: int, settings: MatchSettings
+) -> _Result | None:
+    """Assignment to the track moved on; None if it explains less than half of the wing."""
+    gap = trigger_index - track.trigger_index
+    if not 0 < gap <= 10:
+        return None
+    span, chord, normal = settings.track_sigma_m
+    if track.velocity_m is None:
+        places, normal = track.places_m, 1.6 * normal
+    else:
+        places = track.places_m + track.velocity_m * gap
+    sigma_m = (span * np.sqrt(gap), chord * np.sqrt(gap), normal * np.sqrt(gap))
+    chosen, _ = _assigned(wing, candidates, places, sigma_m, settings.none_cost)
+    result = _refined(wing, candidates, places, chosen, (), settings)
+    return result if np.count_nonzero(result[0] != UNSEEN) >= wing.count / 2 else None
+
+
+def _refined(
+    wing: _Wing,
+    candidates: _Candidates,
+    places: Array,
+    chosen: Indices,
+    sigmas_m: Sequence[tuple[float, float, float]],
+    settings: MatchSettings,
+) -> _Result:
+    """Bend the wing to what was chosen and choose again, ending with the final sigmas."""
+    cost = np.empty((wing.count, len(candidates.spot0)))
+    for sigma_m in (*sigmas_m, settings.final_sigma_m, settings.final_sigma_m):
+        seen = chosen != UNSEEN
+        if seen.any():
+            places = wing.bend_to(places, _picked(candidates.xyz_m, chosen), seen)
+        chosen, cost = _assigned(wing, candidates, places, sigma_m, settings.none_cost)
+    return chosen, places, cost
+
+
+def _assigned(
+    wing: _Wing, candidates: _Candidates, places: Array, sigma_m: Sequence[float], none_cost: float
+) -> tuple[Indices, Array]:
+    """(M,) candidate of each marker and the costs (M, C); every spot is used at most once in each image."""
+    apart = candidates.xyz_m[None, :, :] - places[:, None, :]
+    scaled = np.einsum("mij,mcj->mci", wing.directions(places), apart) / np.asarray(sigma_m)
+    cost = np.sum(scaled**2, axis=2) + candidates.epipolar_d2
+    chosen = np.full(wing.count, UNSEEN, dtype=np.intp)
+    worth = np.flatnonzero((cost < none_cost).any(axis=0))
+    allowed = np.ones(len(worth), dtype=bool)
+    for _ in range(_CONFLICT_ROUNDS):
+        open_ = worth[allowed]
+        padded = np.concatenate([cost[:, open_], np.full((wing.count, wing.count), none_cost)], axis=1)
+        markers, columns = linear_sum_assignment(padded)
+        real = columns < len(open_)
+        chosen[:] = UNSEEN
+        chosen[markers[real]] = open_[columns[real]]
+        loser = _conflict(candidates, chosen, cost)
+        if loser == UNSEEN:
+            return chosen, cost
+        allowed[worth == loser] = False
+    for marker in range(wing.count):  # bounded: what is still in conflict counts as not seen
+        rivals = [m for m in range(marker) if chosen[m] != UNSEEN and _share(candidates, chosen[m], chosen[marker])]
+        if chosen[marker] != UNSEEN and rivals:
+            chosen[marker] = UNSEEN
+    return chosen, cost
+
+
+def _conflict(candidates: _Candidates, chosen: Indices, cost: Array) -> int:
+    """The dearest chosen candidate that shares a spot with another chosen one; ``UNSEEN`` if there is none."""
+    markers = np.flatnonzero(chosen != UNSEEN)
+    taken = chosen[markers]
+    shared = np.zeros(len(taken), dtype=bool)
+    for spots in (candidates.spot0[taken], candidates.spot1[taken]):
+        shared |= (spots[:, None] == spots[None, :]).sum(axis=1) > 1
+    if not shared.any():
+        return UNSEEN
+    return int(taken[shared][np.argmax(cost[markers, taken][shared])])
+
+
+def _share(candidates: _Candidates, a: int, b: int) -> bool:
+    return bool(candidates.spot0[a] == candidates.spot0[b] or candidates.spot1[a] == candidates.spot1[b])
+
+
+def _total(chosen: Indices, cost: Array, settings: MatchSettings) -> float:
+    seen = chosen != UNSEEN
+    return float(cost[np.flatnonzero(seen), chosen[seen]].sum() + settings.none_cost * np.count_nonzero(~seen))
+
+
+def _leaves_spots(chosen: Indices, detections: tuple[Detections, Detections]) -> bool:
+    """Three markers are missing though there are as many spots without one in both images: the track may be lost."""
+    seen = np.count_nonzero(chosen != UNSEEN)
+    spare = min(len(spots) for spots in detections) - seen
+    return bool(min(len(chosen) - seen, spare) >= 3)
+
+
+def _margins(candidates: _Candidates, chosen: Indices, cost: Array, none_cost: float) -> Array:
+    """(M,) how much worse the best other explanation of each seen marker is: a free candidate, a swap, or none."""
+    margin = np.full(len(chosen), np.nan)
+    seen = np.flatnonzero(chosen != UNSEEN)
+    own = cost[seen, chosen[seen]]
+    swapped = cost[np.ix_(seen, chosen[seen])]
+    swap = swapped + swapped.T - own[:, None] - own[None, :]
+    np.fill_diagonal(swap, np.inf)
+    used0, used1 = candidates.spot0[chosen[seen]], candidates.spot1[chosen[seen]]
+    for k, marker in enumerate(seen):
+        others0, others1 = np.delete(used0, k), np.delete(used1, k)
+        free = ~np.isin(candidates.spot0, others0) & ~np.isin(candidates.spot1, others1)
+        free[chosen[marker]] = False
+        best_free = cost[marker, free].min(initial=np.inf) - own[k]
+        margin[marker] = min(best_free, swap[k].min(initial=np.inf), none_cost - own[k])
+    return margin
+
+
+def _next_track(
+    candidates: _Candidates, chosen: Indices, places: Array, trigger_index: int, track: Track | None
+) -> Track | None:
+    seen = chosen != UNSEEN
+    if np.count_nonzero(seen) < len(chosen) / 2:
+        return None
+    measured = np.where(seen[:, None], _picked(candidates.xyz_m, chosen), places)
+    if track is None or not 0 < trigger_index - track.trigger_index <= 10:
+        return Track(trigger_index, measured, None)
+    return Track(trigger_index, measured, (measured - track.places_m) / (trigger_index - track.trigger_index))
+
+
+def _picked(values: NDArray[T], chosen: Indices) -> NDArray[T]:
+    """``values`` of the chosen candidates; whatever where there is none."""
+    if len(values) == 0:
+        return np.zeros((len(chosen), *values.shape[1:]), dtype=values.dtype)
+    return values[np.maximum(chosen, 0)]
+
+
+def _match_by_rows(side: RigSide, layout: MarkerLayout, rays0: Rays, rays1: Rays) -> Matches:
+    """The paper's correspondence: n-th lowest row with n-th lowest row, then markers by distance from the cameras."""
+    count = 2 * len(layout.pairs_station_m)
+    spot0, spot1 = np.full(count, UNSEEN, dtype=np.intp), np.full(count, UNSEEN, dtype=np.intp)
+    order0 = np.argsort(rectified_pixels(side.pair, 0, rays0.xy)[:, 1], kind="stable")
+    order1 = np.argsort(rectified_pixels(side.pair, 1, rays1.xy)[:, 1], kind="stable")
+    paired = min(len(order0), len(order1), count)
+    order0, order1 = order0[:paired], order1[:paired]
+    points = triangulate_rays(side, rays0[order0], rays1[order1])
+    distance_m = np.abs(points.xyz_m[:, 1])
+    outward = np.argsort(distance_m, kind="stable")
+    for pair in range(paired // 2):
+        two = outward[2 * pair : 2 * pair + 2]
+        fore_aft = two[np.argsort(points.xyz_m[two, 0], kind="stable")]  # x is aft
+        spot0[2 * pair : 2 * pair + 2] = order0[fore_aft]
+        spot1[2 * pair : 2 * pair + 2] = order1[fore_aft]
+    seen = spot0 != UNSEEN
+    whole = len(rays0.xy) == len(rays1.xy) == count
+    return Matches(spot0, spot1, np.where(seen, np.inf, np.nan), seen & (not whole), None)
