@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from capture.errors import UsageError
 from reconstruct.beam import Beam
 from reconstruct.rotation import Array, Index, about_axis, cross
-from reconstruct.wing_file import FitSettings, SegmentSection, WingFile
+from reconstruct.wing_file import FitSettings, SegmentSection, WingFile, first_error
 
 __all__ = ["FitSettings", "HalfWing", "Wing", "example_path", "read_wing", "twist_gradient", "twist_rad"]
 
@@ -112,7 +112,7 @@ def read_wing(path: Path, nodes_at_m: tuple[float, ...] = ()) -> Wing:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: not TOML: {error}") from error
     except ValidationError as error:
-        raise UsageError(f"{path}: {_first(error)}") from error
+        raise UsageError(f"{path}: {first_error(error)}") from error
     for station in nodes_at_m:
         if not 0 <= station <= described.semispan_m + _SAME_STATION_M:
             raise UsageError(
@@ -263,15 +263,3 @@ def _masses(
 def _nearest(node_s_m: Array, station_m: Array) -> Index:
     nearest: Index = np.argmin(np.abs(node_s_m[None, :] - station_m[:, None]), axis=1)
     return nearest
-
-
-def _first(error: ValidationError) -> str:
-    """The first thing wrong, as key: reason."""
-    first = error.errors()[0]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
-    reason = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "extra_forbidden":
-        reason = "unknown key (see docs/reference/wing-file.md)"
-    elif first["type"] == "missing":
-        reason = "missing"
-    return f"{key}: {reason}" if key else reason

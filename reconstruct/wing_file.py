@@ -4,7 +4,7 @@ import itertools
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from reconstruct.rotation import Array
 
@@ -16,18 +16,20 @@ Vector = tuple[Finite, Finite, Finite]
 _SAME_STATION_M = 1e-9
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """A table of a file: unknown keys are errors."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Root(_Strict):
+class Root(Strict):
     """Where the right half wing begins in the body frame, and how its root section is turned."""
 
     position_m: Vector = (0.0, 0.0, 0.0)
     incidence_deg: Angle = 0.0  # nose-up
 
 
-class SegmentSection(_Strict):
+class SegmentSection(Strict):
     """A straight (or evenly curved) piece of the half wing with one section."""
 
     length_m: Positive
@@ -73,7 +75,7 @@ class SegmentSection(_Strict):
         return self
 
 
-class Mass(_Strict):
+class Mass(Strict):
     """Something mounted on the wing: a pod, a payload, a lumped piece of structure."""
 
     name: str = ""
@@ -85,7 +87,7 @@ class Mass(_Strict):
     side: Literal["both", "left", "right"] = "both"
 
 
-class Pair(_Strict):
+class Pair(Strict):
     """Two markers at one station."""
 
     station_m: NotNegative
@@ -99,7 +101,7 @@ class Pair(_Strict):
         return self
 
 
-class Markers(_Strict):
+class Markers(Strict):
     """The LEDs of a half wing, innermost pair first."""
 
     pairs: tuple[Pair, ...] = ()
@@ -112,7 +114,7 @@ class Markers(_Strict):
         return self
 
 
-class StiffnessSigma(_Strict):
+class StiffnessSigma(Strict):
     """One sigma of the stiffness, relative."""
 
     EA: NotNegative = 0.0
@@ -121,7 +123,7 @@ class StiffnessSigma(_Strict):
     EI_in: NotNegative = 0.0
 
 
-class FitSettings(_Strict):
+class FitSettings(Strict):
     """What the inverse may assume: where loads act, what they may do to the wing, how good the markers' model is.
 
     The prior of loads at every node is stated by the strains they cause: one sigma of the angle by which the tip turns
@@ -141,7 +143,7 @@ class FitSettings(_Strict):
     outlier_sigma: Positive = 4.6  # a marker farther off than this (χ² of 3, p = 1e-4) is left out
 
 
-class WingFile(_Strict):
+class WingFile(Strict):
     """A whole wing.toml."""
 
     name: Annotated[str, Field(min_length=1)]
@@ -198,3 +200,15 @@ class WingFile(_Strict):
             except ValueError as error:
                 raise ValueError(f"fit.load_stations_m: {error}") from error
         return self
+
+
+def first_error(error: ValidationError) -> str:
+    """The first thing wrong with a file, as key: reason."""
+    first = error.errors()[0]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+    reason = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        reason = "unknown key (see docs/reference/wing-file.md)"
+    elif first["type"] == "missing":
+        reason = "missing"
+    return f"{key}: {reason}" if key else reason
