@@ -61,7 +61,7 @@ def markers(
     triangulation: Annotated[
         Triangulation, typer.Option(help="Least reprojection error, or the paper's matrix Q.")
     ] = Triangulation.default,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; up to one a core if not given.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Measure the markers: frames to 3-D positions in the body frame, with covariances and times."""

@@ -313,10 +313,13 @@ def _margins(candidates: _Candidates, chosen: Indices, cost: Array, none_cost: f
     swapped = cost[np.ix_(seen, chosen[seen])]
     swap = swapped + swapped.T - own[:, None] - own[None, :]
     np.fill_diagonal(swap, np.inf)
-    used0, used1 = candidates.spot0[chosen[seen]], candidates.spot1[chosen[seen]]
+    taken = candidates.spot0[chosen[seen]], candidates.spot1[chosen[seen]]
+    # (seen, C): whether another marker has the candidate's spot in either image
+    rivals = (taken[0][:, None] == candidates.spot0[None, :]).astype(np.intp)
+    rivals += taken[1][:, None] == candidates.spot1[None, :]
+    anybody = rivals.sum(axis=0)
     for k, marker in enumerate(seen):
-        others0, others1 = np.delete(used0, k), np.delete(used1, k)
-        free = ~np.isin(candidates.spot0, others0) & ~np.isin(candidates.spot1, others1)
+        free = anybody == rivals[k]
         free[chosen[marker]] = False
         best_free = cost[marker, free].min(initial=np.inf) - own[k]
         margin[marker] = min(best_free, swap[k].min(initial=np.inf), none_cost - own[k])

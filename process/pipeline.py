@@ -28,6 +28,7 @@ from process.tables import MARKER_SCHEMA
 from process.triangulate import triangulate
 
 BLOCK_TRIGGERS = 50
+BLOCKS_WORTH_A_PROCESS = 4  # starting one costs as much as processing a block or two
 Progress = Callable[[int, int], None]
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
@@ -79,7 +80,7 @@ def markers(
         rig: cameras and layout.
         settings: the methods; None for the defaults.
         progress: called with (frame sets done, frame sets in all).
-        workers: processes; None for as many as there are cores.
+        workers: processes; None for as many as there are cores, or fewer for a short flight.
 
     Raises:
         ProcessError: no recording, or it does not fit the rig (image size).
@@ -99,7 +100,7 @@ def markers_of_recording(
     began = time.monotonic()
     blocks = list(_blocks(recording))
     total = sum(len(block) for block in blocks)
-    workers = min(workers or os.cpu_count() or 1, len(blocks))
+    workers = workers or min(os.cpu_count() or 1, len(blocks) // BLOCKS_WORTH_A_PROCESS)
     whole = _Block()
     for block in _run(blocks, rig, settings, workers):
         for name, parts in block.columns.items():
