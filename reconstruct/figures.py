@@ -58,8 +58,6 @@ def wing_3d(result: Result) -> Figure:
             _ribs(axes, side, int(triggers[side.shape.side]), colour)
     _equal_box(axes, result)
     axes.set_xticks([])  # the chord is too short for a scale
-    axes.set_ylabel("to the right, m", labelpad=18)
-    axes.set_zlabel("up, m", labelpad=4)
     axes.view_init(elev=16, azim=-22)  # from behind and a little to the left
     figure.legend(loc="upper left", bbox_to_anchor=(0.02, 0.98))
     return figure

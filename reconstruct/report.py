@@ -34,8 +34,8 @@ PLATES = (
     Plate(
         "wing-3d",
         "The wing",
-        "Both half wings at the lowest, the middle and the highest position of the tip, to one scale on all axes. "
-        "Lines are the fitted reference axis, dots the measured markers, joined fore to aft; the unloaded wing is grey.",
+        "Both half wings at the lowest, the middle and the highest position of the tip, to one scale, in metres. Lines "
+        "are the fitted reference axis, dots the measured markers, joined fore to aft; the unloaded wing is grey.",
         figures.wing_3d,
     ),
     Plate(

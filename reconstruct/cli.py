@@ -1,0 +1,180 @@
+"""The ``reconstruct`` command: flights and marker tables to wing shapes, and results to reports."""
+
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+from rich.text import Text
+from typer.core import TyperGroup
+
+from capture.console import note, run, say, say_json
+from capture.errors import UsageError
+from reconstruct.report import write_report
+from reconstruct.result import COMPARISON, REPORT, read_result
+from reconstruct.run import Job, Progress, run_comparison, run_job
+from reconstruct.static import static
+from reconstruct.summary import verdict
+
+SHOWN_WARNINGS = 20
+
+
+class _RunByDefault(TyperGroup):
+    """``reconstruct FLIGHT … `` is short for ``reconstruct run FLIGHT …``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=_RunByDefault,
+    no_args_is_help=True,
+    add_completion=False,
+    help="From frames or markers to the shape, twist and loads of the wing. `reconstruct FLIGHT …` is short for "
+    "`reconstruct run FLIGHT …`.",
+)
+
+
+@app.command("run")
+def run_command(
+    wing: Annotated[Path, typer.Option(help="wing.toml: structure, markers, and what the fit may assume.")],
+    out: Annotated[Path, typer.Option("--output", "-o", help="Folder for the result; made when it is not there.")],
+    flight: Annotated[
+        list[Path] | None, typer.Argument(help="The flight's folders, or its marker table (a .parquet file).")
+    ] = None,
+    rig: Annotated[Path | None, typer.Option(help="rig.json of this flight's cameras; needed for frames.")] = None,
+    markers: Annotated[Path | None, typer.Option(help="Start from this marker table instead of frames.")] = None,
+    csv: Annotated[bool, typer.Option(help="Write the tables as CSV too.")] = True,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Reconstruct a flight: markers (from frames, or a table), shapes, loads, summary and report."""
+    flights, table = _sources(list(flight or []), markers)
+    _check_files({"--rig": rig, "--wing": wing, "--markers": table})
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out}: is a file; give a folder for the result")
+    job = Job(tuple(flights), rig, table, wing, out, csv, workers, _command())
+    with _progress() as progress:
+        summary, warnings = run_job(job, progress)
+    if json:
+        say_json({**summary, "warnings": list(warnings), "report": str(out / REPORT)})
+        return
+    for warning in warnings[:SHOWN_WARNINGS]:
+        note(f"warning: {warning}")
+    if len(warnings) > SHOWN_WARNINGS:
+        note(f"warning: and {len(warnings) - SHOWN_WARNINGS} more")
+    say(f"sets            {summary['sets']}, fitted {summary['converged_percent']:.2f} %")
+    say(f"markers seen    {summary['markers_seen_percent']:.2f} %")
+    say(f"residual RMS    {summary['residual_rms_mm']:.3f} mm")
+    say(f"tip sigma       {summary['sigma_tip_mm']:.2f} mm, {summary['sigma_tip_twist_deg']:.3f} deg (median)")
+    say(f"verdict         {' '.join(verdict(summary))}")
+    say(f"time            {summary['wall_s']:.1f} s")
+    say(f"report          {out / REPORT}")
+
+
+@app.command("compare")
+def compare_command(
+    result: Annotated[Path, typer.Argument(help="Folder of `reconstruct run`.")],
+    reference: Annotated[Path, typer.Argument(help="Truth, a simulation or another result: same tables.")],
+    out: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for comparison and report; RESULT if not given.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the comparison as JSON.")] = False,
+) -> None:
+    """Compare a result with a reference, and add the errors to the report."""
+    folder = out or result
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder}: is a file; give a folder for the comparison")
+    found = run_comparison(result, reference, folder, _command()).summary
+    if json:
+        say_json(found)
+        return
+    say(f"sets compared   {found['frames_compared']}, outside of the reference {found['frames_outside_reference']}")
+    for name, key, unit in (
+        ("marker error", "marker_rms_mm", "mm RMS, 3-D"),
+        ("shape error", "shape_rms_mm", "mm RMS, 3-D, all stations"),
+        ("tip error", "tip_error_mm", "mm RMS, 3-D"),
+        ("twist error", "twist_rms_deg", "deg RMS, all stations"),
+        ("within 95 %", "shape_within_95_percent", "% of the position errors are within 1.96 sigma"),
+    ):
+        say(f"{name:<15} {'not known' if found[key] is None else f'{found[key]:.3f} {unit}'}")
+    say(f"report          {folder / REPORT}")
+
+
+@app.command("report")
+def report_command(
+    result: Annotated[Path, typer.Argument(help="Folder of `reconstruct run`.")],
+    comparison: Annotated[
+        Path | None, typer.Option("--compare", help="comparison.json to include; the result's own if not given.")
+    ] = None,
+) -> None:
+    """Draw a result's report again."""
+    own = result / COMPARISON
+    chosen = comparison or (own if own.is_file() else None)
+    say(str(write_report(read_result(result, chosen), result)))
+
+
+app.command("static")(static)
+
+
+def main() -> None:
+    """Entry point of ``reconstruct``."""
+    run(app)
+
+
+def _sources(flights: list[Path], markers: Path | None) -> tuple[list[Path], Path | None]:
+    """Flight folders and marker table, one of which is empty. Raises UsageError when neither or both are given."""
+    tables = [path for path in flights if path.suffix == ".parquet"]
+    if markers is None and len(flights) == 1 and tables:
+        return [], tables[0]
+    if tables:
+        raise UsageError(f"{tables[0]}: a marker table stands alone; give one table, or folders of one flight")
+    if markers is not None and flights:
+        raise UsageError("give a flight or --markers, not both")
+    if markers is None and not flights:
+        raise UsageError("nothing to reconstruct: give a flight's folders, or --markers markers.parquet")
+    for path in flights:
+        if not path.exists():
+            raise UsageError(f"{path}: no such flight folder (nor a command; see reconstruct --help)")
+    return flights, markers
+
+
+def _check_files(files: dict[str, Path | None]) -> None:
+    for option, path in files.items():
+        if path is not None and not path.is_file():
+            raise UsageError(f"{path}: no such file; give {option} the right one")
+
+
+def _command() -> str:
+    return shlex.join(["reconstruct", *sys.argv[1:]])
+
+
+class _Rate(ProgressColumn):
+    """Sets a second, steady."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:.0f} sets/s" if speed else "")
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    """A bar a stage on standard error, if that is a terminal."""
+    columns = (TextColumn("{task.description:<8}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
+    with Bar(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        tasks: dict[str, Any] = {}
+
+        def update(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield update
