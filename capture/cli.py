@@ -1,5 +1,6 @@
 """`wingcap`: the commands of the recording side."""
 
+import shutil
 import signal
 import threading
 from pathlib import Path
@@ -7,8 +8,11 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
+from capture import bench_report
+from capture.bench import CEILING_PAIRS, MODES, bench_cases, bench_target, ceiling, run_case
 from capture.clock import SystemClock
 from capture.config import load_config
 from capture.console import note, run, say, say_json
@@ -102,6 +106,44 @@ def recover(
         raise CaptureError(f"{flight[0]}: no complete frame to give back")
     if not result.clean:
         raise typer.Exit(3)
+
+
+@app.command()
+def bench(
+    target: Annotated[
+        str, typer.Option(help="a folder on the disk to try, `memory`, or `model`: a simulated SSD with stalls")
+    ] = ".",
+    mode: Annotated[str, typer.Option(help=f"{', '.join(MODES)} or all")] = "all",
+    size: Annotated[str, typer.Option(help="image size WxH, or `paper`: 2080x1552 and 1920x1080")] = "2080x1552",
+    rate: Annotated[float, typer.Option(min=0.1, help="triggers a second")] = 25.0,
+    frames: Annotated[int, typer.Option(min=0, help="frames a camera (0: 20 s; the paper's run: 30000)")] = 0,
+    find_ceiling: Annotated[bool, typer.Option("--ceiling", help="find the highest rate without loss too")] = False,
+    plot: Annotated[Path | None, typer.Option(help="write latency and ring depth in time, to this image")] = None,
+    json: Json = False,
+) -> None:
+    """Dropped frames, write latency and CPU of the recording path: the paper's Table 8, and ours beside it.
+
+    At most 8 GB of the target's space are used, and freed at the end.
+    """
+    cases = bench_cases(mode, size, rate, frames)
+    with bench_target(target) as (folder, disk), Progress(console=Console(stderr=True), transient=True) as bar:
+        rows = []
+        for number, case in enumerate(cases):
+            task = bar.add_task(f"{case.mode} {case.width}×{case.height} {case.rate_hz:g} Hz", total=1.0)
+            rows.append(run_case(case, folder / str(number), disk(), lambda x, t=task: bar.update(t, completed=x)))  # type: ignore[misc]
+            shutil.rmtree(folder / str(number), ignore_errors=True)
+        found = None
+        if find_ceiling:
+            task = bar.add_task("ceiling", total=1.0)
+            found = ceiling(cases[-1], folder, CEILING_PAIRS, lambda x: bar.update(task, completed=x))
+    if plot is not None:
+        bench_report.plot(rows, plot)
+    if json:
+        say_json({"rows": [row.as_dict() for row in rows], "ceiling": found})
+        return
+    Console().print(bench_report.table(rows))
+    if found is not None:
+        say(bench_report.ceiling_line(found))
 
 
 def main() -> None:

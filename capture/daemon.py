@@ -20,12 +20,12 @@ from capture.config import Config, LoadedConfig
 from capture.disk import Disk
 from capture.errors import CameraError, DiskError, TriggerBoardError
 from capture.flight import metadata_yaml
-from capture.grabber import Grabber, SideGate
+from capture.grabber import Grabber
+from capture.lane import Lane, LaneParts, make_lane
 from capture.ledger import CameraAccount, Ledger, Place
 from capture.record import SIDES, Diagnostic, Loss, Trigger, encode_diagnostics
-from capture.recorder import Recorder, camera_channels
-from capture.ring import Ring
-from capture.segment import FrameLayout, SmallMessage
+from capture.recorder import Recorder
+from capture.segment import SmallMessage
 from capture.trigger import BoardCount, TriggerBoard, TriggerLog
 from capture.trigger_protocol import Pulse
 
@@ -141,8 +141,7 @@ class Recording:
         self._aux = AuxLog(clock)
         self._triggers = TriggerLog(self._config.trigger.rate_hz)
         self._cameras: dict[Place, tuple[Camera, CameraDescription]] = {}
-        self._grabbers: dict[Place, Grabber] = {}
-        self._recorders: dict[str, Recorder] = {}
+        self._lanes: dict[str, Lane] = {}
         self._failures: list[str] = []
         self._flight_id = f"{self.flight}-{clock.utc_ns():x}"
         places = [(camera.side, camera.name) for camera in self._config.cameras]
@@ -165,19 +164,23 @@ class Recording:
             board.set_rate(self._config.trigger.rate_hz)
             was_running, _ = board.status()
             before = board.end() if was_running else board.status()[1]
-            self._open_disks(name)
-            self._make_grabbers()
-            for recorder in self._recorders.values():
-                recorder.start()
-            for grabber in self._grabbers.values():
-                grabber.arm()
-                grabber.start()
+            self._make_lanes(name)
+            for lane in self._lanes.values():
+                lane.start()
             started_s = self._clock.monotonic_s()
             board.begin(self._config.trigger.first_index, stop.triggers)
             self._control(board, stop, started_s)
             count = self._end_triggers(board)
             seconds = self._clock.monotonic_s() - started_s
             return self._finish(before, count, seconds)
+
+    @property
+    def _grabbers(self) -> dict[Place, Grabber]:
+        return {(lane.side, name): g for lane in self._lanes.values() for name, g in lane.grabbers.items()}
+
+    @property
+    def _recorders(self) -> dict[str, Recorder]:
+        return {side: lane.recorder for side, lane in self._lanes.items()}
 
     def _on_pulse(self, pulse: Pulse, trigger: Trigger) -> None:
         self._triggers.add(pulse)
@@ -202,67 +205,34 @@ class Recording:
                 raise CameraError(f"{name}: {description.model} has no hardware trigger: it cannot be synchronised")
             self._cameras[place.side, place.name] = (camera, description)
 
-    def _open_disks(self, board_name: str) -> None:
-        provenance = self._provenance(board_name)
-        height, width = self._config.camera.height, self._config.camera.width
+    def _make_lanes(self, board_name: str) -> None:
+        parts = LaneParts(
+            disk=self._disk,
+            disk_config=self._config.disks,
+            provenance=self._provenance(board_name),
+            ledger=self._ledger,
+            triggers=self._triggers,
+            clock=self._clock,
+            ring_slots=self._config.ring_slots,
+            lock_memory=self._config.ring.lock_memory,
+            calibration=self._config.calibration,
+        )
         for side in SIDES:
-            names = [name for camera_side, name in self._cameras if camera_side == side]
-            if not names:
+            cameras = {name: camera for (camera_side, name), camera in self._cameras.items() if camera_side == side}
+            if not cameras:
                 continue
             disk: Path = getattr(self._config.disks, side)
+            folder = disk / self.flight
             try:
-                folder = disk / self.flight
                 self._disk.make_folder(folder)
             except OSError as error:
                 raise DiskError(
                     f"{disk}: cannot be written ({error.strerror}): mount the disk, or correct `disks.{side}`"
                 ) from error
-            self._recorders[side] = Recorder(
-                side,
-                folder,
-                names,
-                (height, width),
-                self._config.disks,
-                self._disk,
-                provenance,
-                self._ledger,
-                self._clock,
-                queue_bound=len(names) * self._config.ring_slots,
-                calibration=self._config.calibration,
-            )
-
-    def _make_grabbers(self) -> None:
-        height, width = self._config.camera.height, self._config.camera.width
-        for side, recorder in self._recorders.items():
-            names = [name for camera_side, name in self._cameras if camera_side == side]
-            ids = {channel.topic: channel.id for channel in camera_channels(names, side)}
-            layouts = {
-                name: FrameLayout(
-                    ids[f"/{side}/{name}/image_raw"], ids[f"/{side}/{name}/frame"], f"{side}_{name}", width, height
-                )
-                for name in names
-            }
-            rings = {
-                name: Ring(self._config.ring_slots, layouts[name].slot_bytes, self._config.ring.lock_memory)
-                for name in names
-            }
-            gate = SideGate(list(rings.values()))
-            for name in names:
-                camera, description = self._cameras[side, name]
-                self._grabbers[side, name] = Grabber(
-                    (side, name),
-                    camera,
-                    description,
-                    rings[name],
-                    layouts[name],
-                    gate,
-                    self._triggers,
-                    self._ledger,
-                    recorder,
-                    self._clock,
-                )
-        total_mb = sum(g.ring.slots * g.ring.slot_bytes for g in self._grabbers.values()) / 1e6
-        locked = all(g.ring.locked for g in self._grabbers.values())
+            self._lanes[side] = make_lane(side, folder, cameras, parts)
+        rings = [grabber.ring for grabber in self._grabbers.values()]
+        total_mb = sum(ring.slots * ring.slot_bytes for ring in rings) / 1e6
+        locked = all(ring.locked for ring in rings)
         self._progress(
             f"ring: {self._config.ring_slots} slots a camera, {total_mb:.0f} MB in all, "
             f"{'locked in memory' if locked else 'not locked in memory (RLIMIT_MEMLOCK)'}: "

@@ -44,7 +44,11 @@ class Disk(Protocol):
         """Make a new folder. Raises ``UsageError`` when it exists, ``OSError`` when the disk refuses."""
 
     def create(self, path: Path, mode: str, preallocate_bytes: int) -> DiskFile:
-        """A new file; ``mode`` is ``direct``, ``buffered`` or ``auto`` (direct where the file system can)."""
+        """A new file.
+
+        ``mode`` is ``direct``, ``buffered`` (page cache, write-back bounded), ``auto`` (direct where the file system
+        can), or ``plain`` (page cache, as it comes: for comparison).
+        """
 
     def free_bytes(self, folder: Path) -> int:
         """Room left for us."""
@@ -65,8 +69,10 @@ class SystemDisk:
     def create(self, path: Path, mode: str, preallocate_bytes: int) -> DiskFile:
         """A new file. Preallocation is asked for, not demanded: not every file system can."""
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-        file: DiskFile
-        if mode == "buffered":
+        file: PlainFile
+        if mode == "plain":
+            file = PlainFile(os.open(path, flags, 0o644))
+        elif mode == "buffered":
             file = BufferedFile(os.open(path, flags, 0o644))
         else:
             try:
@@ -95,8 +101,8 @@ class SystemDisk:
         beside.replace(path)
 
 
-class _File:
-    """What both kinds of file share. Blocks that were preallocated beyond the end are given back at close."""
+class PlainFile:
+    """Through the page cache as the kernel likes. Blocks preallocated beyond the end are given back at close."""
 
     direct = False
 
@@ -127,7 +133,7 @@ class _File:
                 os.close(descriptor)
 
 
-class DirectFile(_File):
+class DirectFile(PlainFile):
     """By O_DIRECT: from the caller's memory to the device, past the page cache."""
 
     direct = True
@@ -139,7 +145,7 @@ class DirectFile(_File):
         self.direct = False
 
 
-class BufferedFile(_File):
+class BufferedFile(PlainFile):
     """Through the page cache, with bounded write-back.
 
     The kernel would collect gigabytes of dirty pages and then stall every writer at once; instead each write is started

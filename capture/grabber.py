@@ -4,16 +4,14 @@ import threading
 from dataclasses import dataclass
 
 from capture.camera.base import Camera, CameraDescription, FrameStatus, Grab
-from capture.clock import Clock
 from capture.config import DRIVER_BUFFERS
 from capture.errors import CameraLost
 from capture.ledger import Ledger, Place
-from capture.numbering import FrameNumbering, Numbered
+from capture.numbering import FrameNumbering, Numbered, Triggers
 from capture.record import Frame, LossStage, PtpState
 from capture.recorder import FrameItem, Recorder
 from capture.ring import Ring
 from capture.segment import FrameLayout
-from capture.trigger import TriggerLog
 from capture.worker import Worker
 
 GRAB_TIMEOUT_S = 0.1
@@ -62,10 +60,9 @@ class Grabber(Worker):
         ring: Ring,
         layout: FrameLayout,
         gate: SideGate,
-        triggers: TriggerLog,
+        triggers: Triggers,
         ledger: Ledger,
         recorder: Recorder,
-        clock: Clock,
     ) -> None:
         super().__init__(f"read-{place[0]}-{place[1]}")
         self.place = place
@@ -77,7 +74,6 @@ class Grabber(Worker):
         self._gate = gate
         self._ledger = ledger
         self._recorder = recorder
-        self._clock = clock
         self._numbering = FrameNumbering(description, triggers)
 
     def arm(self) -> None:

@@ -1,14 +1,24 @@
 """A camera's frame counter and clock to trigger indices."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 from capture.camera.base import CameraDescription, Grab
-from capture.trigger import TriggerLog
 
 REPORT_WAIT_S = 0.03
 """How long a frame waits for the board's report of its trigger; the report normally came long before."""
 FIRST_REPORT_WAIT_S = 0.2
 """The same for a camera's first frame, which nothing but the report can number. The driver's buffers bridge it."""
+
+
+class Triggers(Protocol):
+    """Which trigger was given when; capture.trigger.TriggerLog in a flight."""
+
+    def nearest(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
+        """Index and time of the trigger nearest to ``time_ns``."""
+
+    def latest_before(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
+        """Index and time of the last trigger at or before ``time_ns``."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +38,7 @@ class FrameNumbering:
     the device's is not), and its frame counter says how many of the skipped triggers were exposed.
     """
 
-    def __init__(self, camera: CameraDescription, triggers: TriggerLog) -> None:
+    def __init__(self, camera: CameraDescription, triggers: Triggers) -> None:
         self._camera = camera
         self._triggers = triggers
         self._last: tuple[Grab, Numbered] | None = None

@@ -1,0 +1,465 @@
+"""The recording path under load: the paper's Table 8 and beyond, as rows of dropped frames and write latencies.
+
+The cameras of the bench cost nothing: their frames lie in the buffers already, as if a USB controller had put them
+there, and come due by the clock. So what is measured is the recorder.
+
+Modes
+    ``monolithic``  the paper's: one thread, capture and write one after the other, no buffer but the driver's own two
+    ``ring``        one thread as before, but the driver has the whole ring to fill
+    ``threaded``    ours: a read thread a camera, a write thread a disk, ring, CRC, index, ledger
+"""
+
+import contextlib
+import importlib
+import itertools
+import mmap
+import shutil
+import statistics
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from capture.camera.base import Camera, CameraDescription, CameraSettings, FrameStatus, Grab
+from capture.clock import Clock, SystemClock
+from capture.config import DRIVER_BUFFERS, DiskConfig
+from capture.disk import Disk, DiskFile, SystemDisk
+from capture.errors import UsageError
+from capture.grabber import GRAB_TIMEOUT_S
+from capture.lane import Lane, LaneParts, make_lane
+from capture.ledger import Ledger
+from capture.record import CAMERAS, SIDES
+
+MONOLITHIC_BUFFERS = 2
+SEGMENT_MB = 900.0
+SEGMENTS_KEPT = 3  # a side; the oldest are removed, so that no run needs more than 8 GB
+DEFAULT_SECONDS = 20.0
+CEILING_PAIRS = 9
+START_AFTER_NS = 300_000_000
+MODES = ("monolithic", "ring", "threaded")
+
+
+@dataclass(frozen=True)
+class BenchCase:
+    """What one run offers."""
+
+    mode: str
+    width: int
+    height: int
+    rate_hz: float
+    frames: int  # a camera
+    stall_s: float = 2.0  # the ring bridges so long a stall
+
+
+@dataclass
+class BenchRow:
+    """What one run gave."""
+
+    mode: str
+    width: int
+    height: int
+    rate_hz: float
+    offered_mb_s: float
+    frames: int
+    dropped: int
+    dropped_percent: float
+    write_ms: dict[str, float]
+    ring_high_water: int
+    ring_slots: int
+    cpu_cores: float
+    seconds: float
+    latencies_ms: list[float] = field(default_factory=list)
+    ring_depth: list[tuple[float, int]] = field(default_factory=list)  # (seconds, slots in use)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For ``--json``, without the traces."""
+        row = asdict(self)
+        del row["latencies_ms"], row["ring_depth"]
+        return row
+
+
+class BoundedDisk(SystemDisk):
+    """The system's disk, on which only the newest segments of a side are kept."""
+
+    def __init__(self) -> None:
+        self._segments: dict[str, deque[Path]] = {}
+
+    def create(self, path: Path, mode: str, preallocate_bytes: int) -> DiskFile:
+        """A new file; the oldest of its kind gives way."""
+        kept = self._segments.setdefault(f"{path.parent}/{path.name.rsplit('_', 1)[0]}", deque())
+        kept.append(path)
+        if len(kept) > SEGMENTS_KEPT:
+            kept.popleft().unlink(missing_ok=True)
+        return super().create(path, mode, preallocate_bytes)
+
+
+class ClockedTriggers:
+    """Triggers by the clock: number k at ``start_ns + k · period``."""
+
+    def __init__(self, start_ns: int, rate_hz: float) -> None:
+        self.start_ns = start_ns
+        self.period_ns = round(1e9 / rate_hz)
+
+    def nearest(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
+        """Index and time of the trigger nearest to ``time_ns``."""
+        index = round((time_ns - self.start_ns) / self.period_ns)
+        return index, self.start_ns + index * self.period_ns
+
+    def latest_before(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
+        """Index and time of the last trigger at or before ``time_ns``."""
+        index = (time_ns - self.start_ns) // self.period_ns
+        return index, self.start_ns + index * self.period_ns
+
+
+class ClockedCamera(Camera):
+    """Frames come due by the clock; each takes the oldest buffer that was queued by then, or is gone."""
+
+    def __init__(self, case: BenchCase, triggers: ClockedTriggers) -> None:
+        super().__init__("bench", CameraSettings(case.width, case.height, 0, 0.0))
+        self._triggers = triggers
+        self._frames = case.frames
+        self._room: Callable[[], bool] | None = None
+        self._next = 0
+        self._buffers: deque[tuple[int, int]] = deque()  # slot, queued at
+
+    def open(self) -> CameraDescription:
+        """A camera without exposure or readout time."""
+        return CameraDescription("bench", "0", self.settings.width, self.settings.height, 0, 0.0, 0, 1e9, 32, True)
+
+    def queue(self, slot: int, buffer: memoryview) -> None:
+        """An empty buffer."""
+        self._buffers.append((slot, time.time_ns()))
+
+    def arm(self) -> None:
+        """Nothing to do."""
+
+    def follow(self, room: Callable[[], bool]) -> None:
+        """From here on frames come as fast as there is room for them, not by the clock."""
+        self._room = room
+
+    def grab(self, timeout_s: float) -> Grab | None:
+        """The next frame that found a buffer."""
+        if self._room is not None:
+            return self._grab_followed(self._room, timeout_s)
+        give_up_ns = time.time_ns() + int(timeout_s * 1e9)
+        while self._next < self._frames:
+            due_ns = self._triggers.start_ns + self._next * self._triggers.period_ns
+            if due_ns > give_up_ns:
+                time.sleep(timeout_s)
+                return None
+            if (wait_ns := due_ns - time.time_ns()) > 0:
+                time.sleep(wait_ns / 1e9)
+            self._next += 1
+            if self._buffers and self._buffers[0][1] <= due_ns:
+                slot, _ = self._buffers.popleft()
+                return Grab(slot, self._next, due_ns, due_ns + 1, 0, 0.0, FrameStatus.COMPLETE)
+        time.sleep(timeout_s)
+        return None
+
+    def _grab_followed(self, room: Callable[[], bool], timeout_s: float) -> Grab | None:
+        give_up_s = time.monotonic() + timeout_s
+        while self._next >= self._frames or not room():
+            if time.monotonic() > give_up_s:
+                return None
+            time.sleep(0.0005)
+        due_ns = self._triggers.start_ns + self._next * self._triggers.period_ns
+        self._next += 1
+        slot, _ = self._buffers.popleft()
+        return Grab(slot, self._next, due_ns, due_ns + 1, 0, 0.0, FrameStatus.COMPLETE)
+
+    def disarm(self) -> None:
+        """Nothing to do."""
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether every frame has come due."""
+        return self._next >= self._frames
+
+
+def bench_cases(mode: str, size: str, rate_hz: float, frames: int) -> list[BenchCase]:
+    """The cases that a user's words ask for.
+
+    Raises:
+        UsageError: an unknown mode or a size that is none.
+    """
+    modes = MODES if mode == "all" else (mode,)
+    if not set(modes) <= set(MODES):
+        raise UsageError(f"--mode {mode}: use one of {', '.join(MODES)} or all")
+    cases = []
+    for text in ("2080x1552", "1920x1080") if size == "paper" else (size,):
+        try:
+            width, height = (int(part) for part in text.lower().split("x"))
+        except ValueError:
+            raise UsageError(f"--size {text}: give width and height, such as 2080x1552") from None
+        if not (16 <= width <= 16384 and 16 <= height <= 16384):
+            raise UsageError(f"--size {text}: width and height must be 16 to 16384 px")
+        cases += [BenchCase(m, width, height, rate_hz, frames or round(DEFAULT_SECONDS * rate_hz)) for m in modes]
+    return cases
+
+
+@contextlib.contextmanager
+def bench_target(target: str) -> Iterator[tuple[Path, Callable[[], Disk]]]:
+    """A new folder on the target, removed at the end, and a maker of the disk behind it.
+
+    Raises:
+        UsageError: the folder does not exist.
+    """
+    if target == "model":  # loaded by name: the recorder does not know the simulation
+        module: Any = importlib.import_module("hw_sim.disk")
+        yield Path("model"), lambda: module.StallingDisk(module.StallModel())
+        return
+    parent = Path("/dev/shm") if target == "memory" else Path(target)
+    if not parent.is_dir():
+        raise UsageError(f"--target {target}: no such folder; give one on the disk to try, `memory` or `model`")
+    with tempfile.TemporaryDirectory(prefix="wingcap-bench-", dir=parent) as folder:
+        yield Path(folder), BoundedDisk
+
+
+def run_case(case: BenchCase, folder: Path, disk: Disk, progress: Callable[[float], None]) -> BenchRow:
+    """One row of the table.
+
+    Args:
+        case: what to offer.
+        folder: where the files go; a new one for each run.
+        disk: a real disk or a model of one.
+        progress: called with the part done, 0 … 1, about ten times a second.
+
+    Raises:
+        DiskError: the disk refuses.
+    """
+    if case.mode == "threaded":
+        return _run_threaded(case, folder, disk, progress)
+    return _run_monolithic(case, folder, disk, progress)
+
+
+def ceiling(case: BenchCase, folder: Path, pairs: int, progress: Callable[[float], None]) -> dict[str, Any]:
+    """The highest rate without loss against the raw O_DIRECT rate of the same disk, in alternated pairs.
+
+    Our path gets a frame whenever it has a slot for it; raw is one thread a disk that writes the same number of
+    bytes in the same pieces. Both preallocate, pre-touch, and end with fdatasync.
+
+    Returns:
+        ``mb_s``, ``raw_direct_mb_s`` (medians), ``ratio`` (median of the pairs' ratios) and the pairs.
+    """
+    measured: list[tuple[float, float]] = []
+    for number in range(pairs):
+        if number % 2:
+            raw, ours = _ceiling_raw(case, folder / f"raw_{number}"), _ceiling_ours(case, folder / f"ours_{number}")
+        else:
+            ours, raw = _ceiling_ours(case, folder / f"ours_{number}"), _ceiling_raw(case, folder / f"raw_{number}")
+        measured.append((ours, raw))
+        progress((number + 1) / pairs)
+    return {
+        "mb_s": statistics.median(ours for ours, _ in measured),
+        "raw_direct_mb_s": statistics.median(raw for _, raw in measured),
+        "ratio": statistics.median(ours / raw for ours, raw in measured),
+        "pairs": [{"mb_s": ours, "raw_direct_mb_s": raw} for ours, raw in measured],
+    }
+
+
+def _lanes(case: BenchCase, folder: Path, disk: Disk, clock: Clock) -> tuple[Ledger, list[Lane], list[ClockedCamera]]:
+    triggers = ClockedTriggers(0, case.rate_hz)
+    places = list(itertools.product(SIDES, CAMERAS))
+    ledger = Ledger(places, 0, clock.utc_ns, lambda _: None)
+    parts = LaneParts(
+        disk=disk,
+        disk_config=DiskConfig(left=folder, right=folder, segment_mb=SEGMENT_MB, segment_s=1e9, reserve_mb=100),
+        provenance={"flight": "bench"},
+        ledger=ledger,
+        triggers=triggers,
+        clock=clock,
+        ring_slots=round(case.stall_s * case.rate_hz) + DRIVER_BUFFERS,
+        lock_memory=True,
+    )
+    cameras = [ClockedCamera(case, triggers) for _ in places]
+    lanes = []
+    for number, side in enumerate(SIDES):
+        disk.make_folder(folder / side)
+        pair = {name: (cameras[2 * number + k], cameras[2 * number + k].open()) for k, name in enumerate(CAMERAS)}
+        lanes.append(make_lane(side, folder / side, pair, parts))
+    triggers.start_ns = clock.utc_ns() + START_AFTER_NS  # now that all memory has been touched
+    return ledger, lanes, cameras
+
+
+def _run_threaded(case: BenchCase, folder: Path, disk: Disk, progress: Callable[[float], None]) -> BenchRow:
+    clock = SystemClock()
+    ledger, lanes, cameras = _lanes(case, folder, disk, clock)
+    cpu_s, begin_s = time.process_time(), time.monotonic()
+    for lane in lanes:
+        lane.start()
+    depth: list[tuple[float, int]] = []
+    while not all(camera.finished for camera in cameras):
+        clock.sleep(0.1)
+        depth.append((time.monotonic() - begin_s, max(g.ring.in_use for ln in lanes for g in ln.grabbers.values())))
+        done = max(account.recorded for account in ledger.accounts().values())
+        progress(done / case.frames)
+    seconds = time.monotonic() - begin_s
+    _stop(lanes)
+    cpu_cores = (time.process_time() - cpu_s) / seconds
+    ledger.close(case.frames)
+    dropped = sum(account.lost_total for account in ledger.accounts().values())
+    latencies = [us / 1000 for lane in lanes for us in lane.recorder.statistics.latencies_us]
+    rings = [grabber.ring for lane in lanes for grabber in lane.grabbers.values()]
+    return _row(case, dropped, latencies, max(r.high_water for r in rings), rings[0].slots, cpu_cores, seconds, depth)
+
+
+def _stop(lanes: Sequence[Lane]) -> None:
+    for lane in lanes:
+        for grabber in lane.grabbers.values():
+            grabber.stop(deadline_s=10 * GRAB_TIMEOUT_S)
+    for lane in lanes:
+        lane.recorder.stop(deadline_s=60.0)
+        lane.recorder.close({})
+        for worker in (lane.recorder, *lane.grabbers.values()):
+            if worker.error is not None:
+                raise worker.error
+        if lane.recorder.failure is not None:
+            raise lane.recorder.failure
+
+
+def _run_monolithic(case: BenchCase, folder: Path, disk: Disk, progress: Callable[[float], None]) -> BenchRow:
+    """The paper's program: grab a frame from each camera, then write them, in one loop."""
+    triggers = ClockedTriggers(0, case.rate_hz)
+    buffers = MONOLITHIC_BUFFERS if case.mode == "monolithic" else round(case.stall_s * case.rate_hz) + DRIVER_BUFFERS
+    size = -(-case.width * case.height // mmap.PAGESIZE) * mmap.PAGESIZE
+    cameras = [ClockedCamera(case, triggers) for _ in range(4)]
+    memory = [mmap.mmap(-1, size * buffers) for _ in cameras]
+    for camera, area in zip(cameras, memory, strict=True):
+        area[:] = b"\x07" * len(area)
+        for slot in range(buffers):
+            camera.queue(slot, memoryview(area)[:size])
+    files = [_OverwrittenFile(disk, folder / side, side) for side in SIDES]
+    latencies: list[float] = []
+    triggers.start_ns = time.time_ns() + START_AFTER_NS
+    written, cpu_s, begin_s = 0, time.process_time(), time.monotonic()
+    while not all(camera.finished for camera in cameras):
+        for number, camera in enumerate(cameras):
+            grab = camera.grab(0.0) if camera.finished else camera.grab(GRAB_TIMEOUT_S)
+            if grab is None:
+                continue
+            view = memoryview(memory[number])[grab.slot * size : (grab.slot + 1) * size]
+            before_s = time.monotonic()
+            files[number // 2].write(view)
+            latencies.append((time.monotonic() - before_s) * 1e3)
+            camera.queue(grab.slot, view)
+            written += 1
+        progress(written / (4 * case.frames))
+    seconds = time.monotonic() - begin_s
+    cpu_cores = (time.process_time() - cpu_s) / seconds
+    for file in files:
+        file.close()
+    dropped = 4 * case.frames - written
+    return _row(case, dropped, latencies, buffers, buffers, cpu_cores, seconds, [])
+
+
+class _OverwrittenFile:
+    """Through the page cache, as fwrite would; a new file when one is full."""
+
+    def __init__(self, disk: Disk, folder: Path, side: str) -> None:
+        disk.make_folder(folder)
+        self._disk, self._folder, self._side = disk, folder, side
+        self._number, self._size = 0, 0
+        self._file = disk.create(folder / f"{side}_0000.raw", "plain", 0)
+
+    def write(self, view: memoryview) -> None:
+        if self._size > SEGMENT_MB * 1e6:
+            self.close()
+            self._number, self._size = self._number + 1, 0
+            self._file = self._disk.create(self._folder / f"{self._side}_{self._number:04d}.raw", "plain", 0)
+        self._size += self._file.write(view)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _ceiling_ours(case: BenchCase, folder: Path) -> float:
+    clock = SystemClock()
+    ledger, lanes, cameras = _lanes(case, folder, BoundedDisk(), clock)
+    for number, lane in enumerate(lanes):
+        rings = [grabber.ring for grabber in lane.grabbers.values()]
+        for camera in cameras[2 * number : 2 * number + 2]:
+            camera.follow(lambda rings=rings: all(ring.free > 0 for ring in rings))  # type: ignore[misc]
+    begin_s = time.monotonic()
+    for lane in lanes:
+        lane.start()
+    while not all(camera.finished for camera in cameras):
+        clock.sleep(0.01)
+    _stop(lanes)
+    seconds = time.monotonic() - begin_s
+    recorded = sum(account.recorded for account in ledger.accounts().values())
+    _remove(folder)
+    return recorded * case.width * case.height / seconds / 1e6
+
+
+def _ceiling_raw(case: BenchCase, folder: Path) -> float:
+    size = -(-(case.width * case.height + 4096) // mmap.PAGESIZE) * mmap.PAGESIZE
+    buffer = mmap.mmap(-1, size)
+    buffer[:] = b"\x07" * size
+    disk = BoundedDisk()
+
+    def write(side: str) -> None:
+        disk.make_folder(folder / side)
+        per_file = int(SEGMENT_MB * 1e6 / size) + 1
+        left, number = 2 * case.frames, 0
+        while left > 0:
+            file = disk.create(folder / side / f"raw_{number:04d}", "direct", int(SEGMENT_MB * 1e6))
+            for _ in range(min(left, per_file)):
+                file.write(memoryview(buffer))
+            file.sync()
+            file.close()
+            left, number = left - per_file, number + 1
+
+    threads = [threading.Thread(target=write, args=(side,)) for side in SIDES]
+    begin_s = time.monotonic()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    seconds = time.monotonic() - begin_s
+    _remove(folder)
+    return 4 * case.frames * case.width * case.height / seconds / 1e6
+
+
+def _remove(folder: Path) -> None:
+    shutil.rmtree(folder)
+
+
+def _row(
+    case: BenchCase,
+    dropped: int,
+    latencies: list[float],
+    high_water: int,
+    slots: int,
+    cpu_cores: float,
+    seconds: float,
+    depth: list[tuple[float, int]],
+) -> BenchRow:
+    ordered = sorted(latencies) or [0.0]
+    return BenchRow(
+        mode=case.mode,
+        width=case.width,
+        height=case.height,
+        rate_hz=case.rate_hz,
+        offered_mb_s=4 * case.width * case.height * case.rate_hz / 1e6,
+        frames=4 * case.frames,
+        dropped=dropped,
+        dropped_percent=100 * dropped / (4 * case.frames),
+        write_ms={
+            "p50": ordered[len(ordered) // 2],
+            "p99": ordered[int(len(ordered) * 0.99)],
+            "max": ordered[-1],
+        },
+        ring_high_water=high_water,
+        ring_slots=slots,
+        cpu_cores=cpu_cores,
+        seconds=seconds,
+        latencies_ms=latencies,
+        ring_depth=depth,
+    )

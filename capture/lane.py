@@ -1,0 +1,89 @@
+"""A side's lane: its cameras, their rings and read threads, and the write thread of its disk, wired together."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from capture.camera.base import Camera, CameraDescription
+from capture.clock import Clock
+from capture.config import DiskConfig
+from capture.disk import Disk
+from capture.grabber import Grabber, SideGate
+from capture.ledger import Ledger
+from capture.numbering import Triggers
+from capture.record import frame_topic, image_topic
+from capture.recorder import Recorder, camera_channels
+from capture.ring import Ring
+from capture.segment import FrameLayout
+
+
+@dataclass(frozen=True)
+class LaneParts:
+    """What all lanes of a recording share."""
+
+    disk: Disk
+    disk_config: DiskConfig
+    provenance: dict[str, str]
+    ledger: Ledger
+    triggers: Triggers
+    clock: Clock
+    ring_slots: int
+    lock_memory: bool
+    calibration: Path | None = None
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One side."""
+
+    side: str
+    recorder: Recorder
+    grabbers: dict[str, Grabber]  # by camera name
+
+    def start(self) -> None:
+        """Start the write thread, arm the cameras, start the read threads."""
+        self.recorder.start()
+        for grabber in self.grabbers.values():
+            grabber.arm()
+            grabber.start()
+
+
+def make_lane(
+    side: str, folder: Path, cameras: Mapping[str, tuple[Camera, CameraDescription]], parts: LaneParts
+) -> Lane:
+    """Rings, read threads and the write thread of one side; nothing is started yet.
+
+    Raises:
+        DiskError: the first files cannot be made in ``folder``.
+    """
+    names = list(cameras)
+    first = cameras[names[0]][1]
+    recorder = Recorder(
+        side,
+        folder,
+        names,
+        (first.height, first.width),
+        parts.disk_config,
+        parts.disk,
+        parts.provenance,
+        parts.ledger,
+        parts.clock,
+        queue_bound=len(names) * parts.ring_slots,
+        calibration=parts.calibration,
+    )
+    ids = {channel.topic: channel.id for channel in camera_channels(names, side)}
+    layouts = {
+        name: FrameLayout(
+            ids[image_topic(side, name)], ids[frame_topic(side, name)], f"{side}_{name}", first.width, first.height
+        )
+        for name in names
+    }
+    rings = {name: Ring(parts.ring_slots, layouts[name].slot_bytes, parts.lock_memory) for name in names}
+    gate = SideGate(list(rings.values()))
+    grabbers = {
+        name: Grabber(
+            (side, name), camera, description, rings[name], layouts[name], gate, parts.triggers, parts.ledger, recorder
+        )
+        for name, (camera, description) in cameras.items()
+    }
+    return Lane(side, recorder, grabbers)
