@@ -38,14 +38,16 @@ STYLE: dict[str, Any] = {
     "savefig.dpi": 150,
 }
 WIDTH_IN = 8.4
+DETAIL_S = 20.0  # of a longer flight, so much is drawn in detail
+DRAWN_SETS = 600  # more in one curve are drawn as mean and range
 
 
 def wing_3d(result: Result) -> Figure:
     """Both half wings in space at the lowest, the middle and the highest instant; the unloaded wing in grey."""
-    height_in, wide = 3.1, 0.9  # the axes are a square as wide as the picture, which shows its middle
+    height_in, wide = 2.9, 0.9  # the axes are a square as wide as the picture, which shows its middle
     figure = Figure(figsize=(WIDTH_IN, height_in))
     tall = wide * WIDTH_IN / height_in
-    axes: Any = figure.add_axes((0.5 - wide / 2, 0.52 - tall / 2, wide, tall), projection="3d", computed_zorder=False)
+    axes: Any = figure.add_axes((0.5 - wide / 2, 0.46 - tall / 2, wide, tall), projection="3d", computed_zorder=False)
     for side in result.sides.values():
         axes.plot(
             *side.unloaded_xyz_m.T, color=GREY, linewidth=2.2, label="unloaded" if side is _first(result) else None
@@ -63,11 +65,28 @@ def wing_3d(result: Result) -> Figure:
     return figure
 
 
+def is_long(result: Result) -> bool:
+    """Whether single oscillations can no longer be told apart in a figure of the whole flight."""
+    return bool(np.ptp(np.concatenate([_seconds(result, side) for side in result.sides.values()])) > DETAIL_S)
+
+
 def tip(result: Result) -> Figure:
-    """Displacement of the tip and its twist in time, with bands of two sigma."""
+    """Displacement of the tip and its twist in time, with bands of two sigma; of a long flight around its highest."""
+    first = _first(result)
+    start = _seconds(result, first)[np.nanargmax(first.frames["tip_dz_m"])] - DETAIL_S / 2
+    return _tip(result, (start, start + DETAIL_S) if is_long(result) else (-np.inf, np.inf))
+
+
+def tip_whole(result: Result) -> Figure:
+    """The same of the whole flight."""
+    return _tip(result, (-np.inf, np.inf))
+
+
+def _tip(result: Result, between_s: tuple[float, float]) -> Figure:
     figure, axes = _panels(3, 1, 5.6)
     for name, side in result.sides.items():
         time = _seconds(result, side)
+        time = np.where((time >= between_s[0]) & (time <= between_s[1]), time, np.nan)
         for axis, (value, scale) in zip(
             axes, (("tip_dz_m", 1e3), ("tip_dx_m", 1e3), ("tip_twist_deg", 1.0)), strict=True
         ):
@@ -123,8 +142,8 @@ def residuals_in_time(result: Result) -> Figure:
     figure, axes = _panels(2, 1, 3.7)
     for name, side in result.sides.items():
         time = _seconds(result, side)
-        axes[0].plot(time, side.frames["residual_rms_mm"], color=COLOURS[name], label=name, linewidth=1.0)
-        axes[1].plot(time, side.frames["chi2_per_dof"], color=COLOURS[name], linewidth=1.0)
+        _curve(axes[0], time, side.frames["residual_rms_mm"], name)
+        _curve(axes[1], time, side.frames["chi2_per_dof"], name)
     axes[1].axhline(1.0, color=GREY, linewidth=1.0, linestyle="--")
     axes[0].set(title="Residual of the markers (RMS of the set)", ylabel="mm", ylim=(0, None))
     axes[1].set(title="χ² a degree of freedom (1: as the stated noise)", xlabel=_time_label(result), ylim=(0, None))
@@ -163,11 +182,11 @@ def error_in_time(result: Result) -> Figure:
     """Error of shape, tip and twist against the reference, set by set."""
     figure, axes = _panels(3, 1, 5.2)
     for name, errors in result.errors.items():
-        time = (errors.timestamp_ns - result.start_ns) * 1e-9
+        time = np.asarray((errors.timestamp_ns - result.start_ns) * 1e-9, dtype=np.float64)
         distance = 1e3 * np.linalg.norm(errors.shape_m, axis=-1)
-        axes[0].plot(time, rms(distance, axis=1), color=COLOURS[name], label=name, linewidth=1.0)
-        axes[1].plot(time, distance[:, -1], color=COLOURS[name], linewidth=1.0)
-        axes[2].plot(time, rms(errors.twist_deg, axis=1), color=COLOURS[name], linewidth=1.0)
+        _curve(axes[0], time, rms(distance, axis=1), name)
+        _curve(axes[1], time, distance[:, -1], name)
+        _curve(axes[2], time, rms(errors.twist_deg, axis=1), name)
     axes[0].set(title="Shape error (RMS over the stations)", ylabel="mm", ylim=(0, None))
     axes[1].set(title="Tip error (3-D distance)", ylabel="mm", ylim=(0, None))
     axes[2].set(title="Twist error (RMS over the stations)", ylabel="deg", ylim=(0, None), xlabel=_time_label(result))
@@ -287,7 +306,28 @@ def _panels(rows: int, columns: int, height_in: float, *, sharex: bool = True) -
     return figure, figure.subplots(rows, columns, sharex=sharex)
 
 
+def _curve(axis: Axes, time: Floats, value: Floats, side: str) -> None:
+    """A line, or of more sets than can be drawn apart the mean and the range of neighbours."""
+    if time.size <= DRAWN_SETS:
+        axis.plot(time, value, color=COLOURS[side], label=side, linewidth=1.0)
+        return
+    chunk = -(-time.size // DRAWN_SETS)
+    padded = np.full((2, chunk * DRAWN_SETS), np.nan)
+    padded[:, : time.size] = time, value
+    when, values = padded.reshape(2, DRAWN_SETS, chunk)
+    known = np.isfinite(values).any(axis=1)
+    centre, values = np.nanmean(when[known], axis=1), values[known]
+    low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
+    axis.fill_between(centre, low, high, color=COLOURS[side], alpha=0.3, linewidth=0)
+    axis.plot(centre, np.nanmean(values, axis=1), color=COLOURS[side], label=side, linewidth=1.0)
+
+
 def _band(axis: Axes, time: Floats, value: Floats, sigma: Floats, side: str) -> None:
+    shown = np.isfinite(time)
+    time, value, sigma = time[shown], value[shown], sigma[shown]
+    if time.size > DRAWN_SETS:
+        _curve(axis, time, value, side)
+        return
     axis.fill_between(time, value - 2 * sigma, value + 2 * sigma, color=COLOURS[side], alpha=0.22, linewidth=0)
     axis.plot(time, value, color=COLOURS[side], label=side)
 

@@ -28,6 +28,7 @@ class Plate:
     section: str
     caption: str
     draw: Callable[[Result], Figure]
+    applies: Callable[[Result], bool] = lambda _: True
 
 
 PLATES = (
@@ -41,8 +42,16 @@ PLATES = (
     Plate(
         "tip",
         "The wing",
-        "The outermost station in time, against the unloaded wing. Bands are two sigma, as the fit states them.",
+        "The outermost station in time, against the unloaded wing. Bands are two sigma, as the fit states them. Of a "
+        "long flight, this is the part around the highest position.",
         figures.tip,
+    ),
+    Plate(
+        "tip-whole",
+        "The wing",
+        "The same over the whole flight: mean and range of neighbouring sets.",
+        figures.tip_whole,
+        figures.is_long,
     ),
     Plate(
         "span",
@@ -119,7 +128,7 @@ def write_report(result: Result, folder: Path) -> Path:
     plates = (*(COMPARED_PLATES if result.comparison is not None else ()), *PLATES)
     (folder / FIGURES).mkdir(parents=True, exist_ok=True)
     sections: dict[str, list[str]] = {}
-    for plate in plates:
+    for plate in (plate for plate in plates if plate.applies(result)):
         png = _draw(plate, result)
         (folder / FIGURES / f"{plate.name}.png").write_bytes(png)
         sections.setdefault(plate.section, []).append(_figure(plate, png))

@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from reconstruct.instants import InstantMarkers, InstantSettings, at_common_inst
 from reconstruct.tables import Bools, Floats, Ints, MarkerSeries, Words
 from reconstruct.wing import HalfWing, Wing
 from reconstruct.wing_file import FitSettings
+
+_Rows = dict[str, Any]  # field of SideFits → array over a block's sets
 
 BLOCK_SETS = 20  # sets fitted one after the other with warm starts; fixed, so that workers do not change results
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -58,7 +61,7 @@ class SideFits:
 @dataclass(frozen=True)
 class _Block:
     side: str
-    rows: slice
+    first: int
     xyz_m: Floats
     cov_m2: Floats
 
@@ -79,7 +82,7 @@ def fit_series(
     Raises UsageError when the markers are not those of ``wing`` or none was measured, ReconstructError when a worker
     process dies.
     """
-    _settings(wing)
+    settings = _settings(wing)
     measured = {}
     for side, series in markers.items():
         half = _half(wing, side)
@@ -88,12 +91,16 @@ def fit_series(
     if not any(moved.points.any() for _, moved in measured.values()):
         raise UsageError("no marker was measured in any set; look at the flags column of the marker table")
     blocks = [block for side, (_, moved) in measured.items() for block in _blocks(side, moved)]
-    fits: dict[str, list[Fit | None]] = {side: [None] * moved.points.shape[0] for side, (_, moved) in measured.items()}
-    for block, fitted in _fit_blocks(blocks, wing, workers or len(os.sched_getaffinity(0))):
-        fits[block.side][block.rows] = fitted
+    done: dict[str, dict[int, _Rows]] = {side: {} for side in measured}
+    for block, rows in _fit_blocks(blocks, wing, workers or len(os.sched_getaffinity(0))):
+        done[block.side][block.first] = rows
         if progress is not None:
-            progress(len(fitted))
-    return {side: _gather(_half(wing, side), *measured[side], fits[side]) for side in measured}
+            progress(len(block.xyz_m))
+    load_s_m = np.array(settings.load_stations_m)
+    return {
+        side: _gather(_half(wing, side), *measured[side], load_s_m, [done[side][first] for first in sorted(done[side])])
+        for side in measured
+    }
 
 
 def _half(wing: Wing, side: str) -> HalfWing:
@@ -135,11 +142,13 @@ def _as_in(half: HalfWing, series: MarkerSeries) -> MarkerSeries:
 
 def _blocks(side: str, moved: InstantMarkers) -> list[_Block]:
     sets = moved.points.shape[0]
-    parts = [slice(first, min(first + BLOCK_SETS, sets)) for first in range(0, sets, BLOCK_SETS)]
-    return [_Block(side, part, moved.xyz_m[part], moved.cov_m2[part]) for part in parts]
+    return [
+        _Block(side, first, moved.xyz_m[first : first + BLOCK_SETS], moved.cov_m2[first : first + BLOCK_SETS])
+        for first in range(0, sets, BLOCK_SETS)
+    ]
 
 
-def _fit_blocks(blocks: list[_Block], wing: Wing, workers: int) -> Iterator[tuple[_Block, list[Fit]]]:
+def _fit_blocks(blocks: list[_Block], wing: Wing, workers: int) -> Iterator[tuple[_Block, _Rows]]:
     """Blocks with their fits, in the order they get done."""
     workers = min(workers, len(blocks))
     if workers <= 1:
@@ -153,8 +162,8 @@ def _fit_blocks(blocks: list[_Block], wing: Wing, workers: int) -> Iterator[tupl
     ):
         pending = {pool.submit(_fit_block_here, block): block for block in blocks}
         try:
-            for done in as_completed(pending):
-                yield pending[done], done.result()
+            for done in as_completed(list(pending)):
+                yield pending.pop(done), done.result()
         except BrokenProcessPool as error:
             raise ReconstructError("a worker process died while fitting (out of memory?); try --workers 1") from error
         finally:
@@ -185,55 +194,72 @@ def _set_wing(wing: Wing) -> None:
     _wing = wing
 
 
-def _fit_block_here(block: _Block) -> list[Fit]:
+def _fit_block_here(block: _Block) -> _Rows:
     assert _wing is not None
     return fit_block(_half(_wing, block.side), _settings(_wing), block.xyz_m, block.cov_m2)
 
 
-def fit_block(half: HalfWing, settings: FitSettings, xyz_m: Floats, cov_m2: Floats) -> list[Fit]:
-    """Fit consecutive sets, each from the last one's fit (one that did not converge starts nothing)."""
-    fits: list[Fit] = []
+def fit_block(half: HalfWing, settings: FitSettings, xyz_m: Floats, cov_m2: Floats) -> dict[str, Any]:
+    """Fit consecutive sets, each from the last one's fit (one that did not converge starts nothing).
+
+    Returns what SideFits has of them, an array a field; the rest of a fit is dropped here, where it was made.
+    """
+    rows = []
+    fit: Fit | None = None
     for xyz, cov in zip(xyz_m, cov_m2, strict=True):
-        fits.append(fit_frame(half, xyz, cov, settings, start=fits[-1] if fits else None))
-    return fits
+        fit = fit_frame(half, xyz, cov, settings, start=fit)
+        rows.append(_row(half, fit))
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def _gather(half: HalfWing, series: MarkerSeries, moved: InstantMarkers, found: list[Fit | None]) -> SideFits:
-    fits = [fit for fit in found if fit is not None]
-    net, sigma_net = zip(*(_net(half, fit) for fit in fits), strict=True)
-    variance = np.array([np.diag(fit.load_covariance) for fit in fits])
-    used = np.array([fit.used for fit in fits])
-    alone = used & (moved.points == 1)
+def _row(half: HalfWing, fit: Fit) -> dict[str, Any]:
+    net, sigma_net = _net(half, fit)
+    return {
+        "xyz_m": fit.position_m,
+        "sigma_xyz_m": fit.sigma_position_m,
+        "twist_rad": fit.twist_rad,
+        "sigma_twist_rad": fit.sigma_twist_rad,
+        "residual_m": fit.residual_m,
+        "used": fit.used,
+        "loads": fit.loads,
+        "sigma_loads": np.sqrt(np.diag(fit.load_covariance)).reshape(-1, 6),
+        "net": net,
+        "sigma_net": sigma_net,
+        "chi2": fit.chi2,
+        "dof": fit.dof,
+        "iterations": fit.iterations,
+        "outliers": int(fit.outlier.sum()),
+        "reason": fit.reason,
+    }
+
+
+def _gather(
+    half: HalfWing, series: MarkerSeries, moved: InstantMarkers, load_s_m: Floats, blocks: list[_Rows]
+) -> SideFits:
+    rows = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    outliers = rows.pop("outliers")
+    reason = rows.pop("reason").astype(object)
+    alone = (rows["used"] & (moved.points == 1)).any(axis=1)
+    flagged = {"not_fitted": reason != "", "outlier": outliers > 0, "row_time": alone}
     return SideFits(
         side=series.side,
         trigger_index=series.trigger_index,
         timestamp_ns=series.frame_timestamp_ns,
         s_m=half.node_s_m,
         unloaded_xyz_m=half.rest_position_m,
-        xyz_m=np.array([fit.position_m for fit in fits]),
-        sigma_xyz_m=np.array([fit.sigma_position_m for fit in fits]),
-        twist_rad=np.array([fit.twist_rad for fit in fits]),
-        sigma_twist_rad=np.array([fit.sigma_twist_rad for fit in fits]),
         markers=series,
-        residual_m=np.array([fit.residual_m for fit in fits]),
-        used=used,
         points=moved.points,
-        load_s_m=fits[0].load_s_m,
-        loads=np.array([fit.loads for fit in fits]),
-        sigma_loads=np.sqrt(variance).reshape(len(fits), -1, 6),
-        net=np.array(net),
-        sigma_net=np.array(sigma_net),
-        chi2=np.array([fit.chi2 for fit in fits]),
-        dof=np.array([fit.dof for fit in fits]),
-        iterations=np.array([fit.iterations for fit in fits]),
-        flags=np.array([_flags(fit, lone) for fit, lone in zip(fits, alone.any(axis=1), strict=True)], dtype=object),
-        reason=np.array([fit.reason for fit in fits], dtype=object),
+        load_s_m=load_s_m,
+        flags=np.array(
+            [
+                ",".join(name for name, applies in zip(flagged, row, strict=True) if applies)
+                for row in zip(*flagged.values(), strict=True)
+            ],
+            dtype=object,
+        ),
+        reason=reason,
+        **rows,
     )
-
-
-def _flags(fit: Fit, alone: bool) -> str:
-    reasons = {"not_fitted": not fit.converged, "outlier": bool(fit.outlier.any()), "row_time": bool(alone)}
-    return ",".join(name for name, applies in reasons.items() if applies)
 
 
 def _net(half: HalfWing, fit: Fit) -> tuple[Floats, Floats]:

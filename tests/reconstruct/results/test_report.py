@@ -1,6 +1,7 @@
 """The report: every figure is in it, nothing is fetched from elsewhere, and its words agree with its numbers."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 
 from capture.errors import ReconstructError, UsageError
 from reconstruct import figures
-from reconstruct.report import COMPARED_PLATES, PLATES, write_report
+from reconstruct.report import COMPARED_PLATES, PLATES, Plate, write_report
 from reconstruct.result import read_result
 from reconstruct.run import Job, run_comparison, run_job
 from reconstruct.summary import verdict
@@ -54,16 +55,21 @@ def result(bending_wing: Any, wing_file: Path, tmp_path_factory: pytest.TempPath
     return out
 
 
+def names(*plates: Plate) -> list[str]:
+    """The figures of a short flight."""
+    return sorted(plate.name for plate in plates if plate.name != "tip-whole")
+
+
 def test_every_figure_is_embedded_and_nothing_is_external(result: Path) -> None:
     text = (result / "report.html").read_text(encoding="utf-8")
     page = Page(text)
     assert page.open == []
-    assert sorted(page.figures) == sorted(plate.name for plate in (*PLATES, *COMPARED_PLATES))
+    assert sorted(page.figures) == names(*PLATES, *COMPARED_PLATES)
     assert len(page.sources) == len(page.figures)
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
     assert not re.search(r"(https?:)?//[a-z]|@import|url\(|<script|<link|<iframe", re.sub(r"base64,[^\"]*", "", text))
-    for plate in (*PLATES, *COMPARED_PLATES):
-        assert (result / "figures" / f"{plate.name}.png").read_bytes().startswith(b"\x89PNG")
+    for name in names(*PLATES, *COMPARED_PLATES):
+        assert (result / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert "truth &lt;&amp;&gt;" in text  # names of files are text, not tags
 
 
@@ -79,7 +85,7 @@ def test_words_and_ledger_tell_what_is_missing(result: Path) -> None:
 
 def test_without_a_comparison(result: Path, tmp_path: Path) -> None:
     page = write_report(read_result(result), tmp_path).read_text(encoding="utf-8")
-    assert sorted(Page(page).figures) == sorted(plate.name for plate in PLATES)
+    assert sorted(Page(page).figures) == names(*PLATES)
     assert "reference" not in re.sub(r"base64,[^\"]*|reference axis", "", page)
 
 
@@ -93,6 +99,27 @@ def test_chosen_instants_are_the_extremes(result: Path) -> None:
     assert lift[row[chosen["lowest"]["right"]]] == lift.min()
     assert lift[row[chosen["highest"]["right"]]] == lift.max()
     assert all(np.isfinite(read.sides["left"].frames["tip_dz_m"][names["left"]]) for names in chosen.values())
+
+
+def test_a_long_flight_is_drawn_as_range_and_in_detail(result: Path) -> None:
+    short = read_result(result)
+    sets = figures.DRAWN_SETS * 2 + 1
+    row = np.arange(sets) % 12
+    sides = {}
+    for name, side in short.sides.items():
+        time = short.start_ns + np.arange(sets) * 40_000_000
+        shape = replace(side.shape, trigger_index=np.arange(sets), timestamp_ns=time, flags=side.shape.flags[row])
+        sides[name] = replace(side, shape=shape, frames={key: value[row] for key, value in side.frames.items()})
+    long = replace(short, sides=sides)
+    assert figures.is_long(long)
+    assert not figures.is_long(short)
+    detail, whole = figures.tip(long).axes[0], figures.tip_whole(long).axes[0]
+    shown = np.asarray(detail.lines[0].get_xdata())
+    highest = np.nanargmax(sides["right"].frames["tip_dz_m"]) * 0.04
+    assert np.ptp(shown) <= figures.DETAIL_S
+    assert shown.min() <= highest <= shown.max()
+    assert len(np.asarray(whole.lines[0].get_xdata())) <= figures.DRAWN_SETS
+    assert np.nanmax(np.asarray(whole.lines[0].get_xdata())) > 40.0
 
 
 def test_one_wing_and_one_set_are_enough(bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
