@@ -1,0 +1,310 @@
+"""Corners of a board in many views of two cameras to the calibrated pair, with its uncertainty.
+
+Two methods. ``paper``: each camera alone (Zhang), then the pose between them with the intrinsics held, as the paper's
+§II.B and D. ``joint``: everything together, and by default the board's own printed corners too, which removes most of
+the error that a nominal board leaves in the absolute position.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.errors import ProcessError
+from process.board import Board
+from process.bundle import Adjustment, Estimate, Freedom, adjust, rms_px, rotation_matrix
+from process.camera_model import CameraModel, StereoPair, pose_matrix
+
+Array = NDArray[np.float64]
+
+MIN_VIEWS = 3
+MIN_VIEWS_FOR_PRINT = 6  # below it, the printed corners are not told from the lens: the nominal board is used
+MIN_TILT_DEG = 5.0
+OUTLIER_RATIO = 3.0
+SAME_OPTIMUM = 1.0 + 1e-4
+CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-12)
+
+
+class Method(StrEnum):
+    """Choices of ``--method``."""
+
+    joint = "joint"
+    paper = "paper"
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """How to calibrate."""
+
+    method: Method = Method.joint
+    nominal_board: bool = False
+    distortion_terms: int = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A calibrated pair and how well it fits."""
+
+    pair: StereoPair
+    settings: CalibrationSettings
+    camera_rms_px: tuple[float, float]
+    """method paper: of each camera alone (the paper's Table 5); joint: of each camera in the joint solution"""
+    alone_rms_px: tuple[float, float]
+    """of each camera calibrated alone on the nominal board"""
+    stereo_rms_px: float
+    two_stage_rms_px: float
+    """of the paper's way: intrinsics held, nominal board"""
+    library_rms_px: tuple[float, float, float]
+    """where OpenCV's own solvers ended: camera 0, camera 1, stereo with the intrinsics held"""
+    sigma_px: float
+    """noise of one coordinate, from the residuals"""
+    gradient: float
+    """0 at the optimum; see bundle.Adjustment"""
+    board_m: Array
+    """(N, 2) printed corners, estimated or nominal"""
+    board_sigma_m: Array
+    """(N, 2), zero for the nominal board"""
+    residuals_px: Array
+    """(2, views, N, 2) of the views used"""
+    used: NDArray[np.intp]
+    """indices of the views used"""
+    rejected: dict[int, str]
+    """index of each view left out: why"""
+    warnings: list[str] = field(default_factory=list)
+
+
+def calibrate(
+    corners_px: Array, board: Board, size_px: tuple[int, int], settings: CalibrationSettings | None = None
+) -> Calibration:
+    """Calibrate a pair from ``corners_px`` (2, V, N, 2) of both cameras, in the board's order.
+
+    ``size_px`` is the images' width and height.
+    Views whose residuals stand out are left out and said. Raises ProcessError, with the remedy, if fewer than three
+    usable views remain, if they do not determine the cameras, or if the cameras are swapped.
+    """
+    settings = settings or CalibrationSettings()
+    used = np.arange(corners_px.shape[1])
+    rejected: dict[int, str] = {}
+    while True:
+        if len(used) < MIN_VIEWS:
+            reasons = "; ".join(f"view {view + 1}: {reason}" for view, reason in rejected.items())
+            raise ProcessError(
+                f"{len(used)} usable views, at least {MIN_VIEWS} are needed" + (reasons and f" ({reasons})")
+            )
+        check_poses_differ(corners_px[0, used], board, size_px)
+        stages = _solve(corners_px[:, used], board, size_px, settings)
+        view_rms = np.sqrt(np.mean(np.sum(stages.final.residuals_px**2, axis=-1), axis=(0, 2)))
+        worst = int(np.argmax(view_rms))
+        limit = OUTLIER_RATIO * float(np.median(view_rms))
+        if view_rms[worst] <= max(limit, 1e-6):
+            return _result(stages, board, size_px, settings, used, rejected)
+        rejected[int(used[worst])] = (
+            f"residual {view_rms[worst]:.2f} px, the others' median is {limit / OUTLIER_RATIO:.2f} px: "
+            "board moved between the two pictures, or they are not of the same instant"
+        )
+        used = np.delete(used, worst)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stages:
+    alone: list[Adjustment]
+    two_stage: Adjustment
+    final: Adjustment
+    library_rms_px: tuple[float, float, float]
+
+
+def _solve(corners_px: Array, board: Board, size_px: tuple[int, int], settings: CalibrationSettings) -> _Stages:
+    library = [start_alone(corners, board, size_px, settings.distortion_terms) for corners in corners_px]
+    alone = [
+        adjust(corners[None], start, Freedom(distortion_terms=settings.distortion_terms))
+        for corners, (start, _) in zip(corners_px, library, strict=True)
+    ]
+    start = _join(alone)
+    if start.stereo[3] > 0.0:
+        raise ProcessError(
+            "cam0 and cam1 are swapped: cam1 must be the right one as the pair looks at the board; "
+            "exchange --cam0 and --cam1"
+        )
+    two_stage = adjust(corners_px, start, Freedom(intrinsics=False))
+    stereo_rms_px = _library_stereo_rms_px(corners_px, start, size_px)
+    final = two_stage
+    if settings.method is Method.joint:
+        board_moves = not settings.nominal_board and corners_px.shape[1] >= MIN_VIEWS_FOR_PRINT
+        freedom = Freedom(distortion_terms=settings.distortion_terms, board=board_moves)
+        final = adjust(corners_px, two_stage.estimate, freedom)
+    return _Stages(alone, two_stage, final, (library[0][1], library[1][1], stereo_rms_px))
+
+
+def start_alone(
+    corners_px: Array, board: Board, size_px: tuple[int, int], distortion_terms: int
+) -> tuple[Estimate, float]:
+    """OpenCV's calibration (Zhang) of one camera from ``corners_px`` (V, N, 2), and its RMS in pixels."""
+    plane = np.column_stack([board.points_m, np.zeros(board.corners)]).astype(np.float32)
+    views = [view.astype(np.float32).reshape(-1, 1, 2) for view in corners_px]
+    flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3 if distortion_terms == 2 else 0
+    try:
+        rms, K, distortion, rotations, translations = cv2.calibrateCamera(
+            [plane] * len(views), views, size_px, None, None, flags=flags, criteria=CRITERIA
+        )
+    except cv2.error as error:
+        raise ProcessError("the views do not determine the camera: take views with the board tilted") from error
+    poses = [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True)]
+    intrinsics = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], distortion.ravel()[:5]])
+    return Estimate(intrinsics[None], np.zeros(6), np.array(poses), board.points_m), float(rms)
+
+
+def _join(alone: list[Adjustment]) -> Estimate:
+    """Both cameras' estimates, and the pose between them that most views agree on."""
+    poses = np.array(
+        [
+            pose_matrix(seen1[:3], seen1[3:]) @ np.linalg.inv(pose_matrix(seen0[:3], seen0[3:]))
+            for seen0, seen1 in zip(*(one.estimate.views for one in alone), strict=True)
+        ]
+    )
+    middle = np.median(poses[:, :3, 3], axis=0)
+    U, _, Vt = np.linalg.svd(np.median(poses[:, :3, :3], axis=0))
+    rotation = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    stereo = np.concatenate([cv2.Rodrigues(rotation)[0].ravel(), middle])
+    intrinsics = np.vstack([one.estimate.intrinsics for one in alone])
+    return Estimate(intrinsics, stereo, alone[0].estimate.views, alone[0].estimate.board_m)
+
+
+def _library_stereo_rms_px(corners_px: Array, start: Estimate, size_px: tuple[int, int]) -> float:
+    """Where cv2.stereoCalibrate ends with the intrinsics held: some versions stop early."""
+    plane = np.column_stack([start.board_m, np.zeros(len(start.board_m))]).astype(np.float32)
+    views = [[view.astype(np.float32).reshape(-1, 1, 2) for view in camera] for camera in corners_px]
+    cameras = [CameraModel.from_intrinsics(*size_px, values) for values in start.intrinsics]
+    rms, *_ = cv2.stereoCalibrate(
+        [plane] * len(views[0]),
+        views[0],
+        views[1],
+        cameras[0].K.copy(),
+        cameras[0].distortion.copy(),
+        cameras[1].K.copy(),
+        cameras[1].distortion.copy(),
+        size_px,
+        flags=cv2.CALIB_FIX_INTRINSIC,
+        criteria=CRITERIA,
+    )
+    return float(rms)
+
+
+def _result(
+    stages: _Stages,
+    board: Board,
+    size_px: tuple[int, int],
+    settings: CalibrationSettings,
+    used: NDArray[np.intp],
+    rejected: dict[int, str],
+) -> Calibration:
+    final, estimate = stages.final, stages.final.estimate
+    joint = settings.method is Method.joint
+    # the paper's way leaves the intrinsics out of its last step: that step's covariance alone would be far too small
+    covariance = _with_print_scale(final.covariance, final, board) if joint else None
+    cam0, cam1 = (CameraModel.from_intrinsics(*size_px, values) for values in estimate.intrinsics)
+    alone = (stages.alone[0].rms_px, stages.alone[1].rms_px)
+    in_joint = (rms_px(final.residuals_px[0]), rms_px(final.residuals_px[1]))
+    return Calibration(
+        pair=StereoPair(cam0, cam1, pose_matrix(estimate.stereo[:3], estimate.stereo[3:]), covariance),
+        settings=settings,
+        camera_rms_px=in_joint if joint else alone,
+        alone_rms_px=alone,
+        stereo_rms_px=final.rms_px,
+        two_stage_rms_px=stages.two_stage.rms_px,
+        library_rms_px=stages.library_rms_px,
+        sigma_px=final.sigma_px,
+        gradient=final.gradient,
+        board_m=estimate.board_m,
+        board_sigma_m=np.sqrt(np.diag(final.board_covariance_m2)).reshape(-1, 2),
+        residuals_px=final.residuals_px,
+        used=used,
+        rejected=rejected,
+        warnings=_warnings(stages, settings, size_px, len(used)),
+    )
+
+
+def _with_print_scale(covariance: Array, final: Adjustment, board: Board) -> Array:
+    """Add what the corners cannot show: the mean scale of a board whose corners are printed with random errors."""
+    errors = final.estimate.board_m - board.points_m
+    print_variance = float(np.sum(errors**2)) / (2 * board.corners - 4)
+    scale_variance = print_variance / float(np.sum(board.points_m**2))
+    translation = np.concatenate([np.zeros(len(covariance) - 3), final.estimate.stereo[3:]])
+    return covariance + scale_variance * np.outer(translation, translation)
+
+
+def _warnings(stages: _Stages, settings: CalibrationSettings, size_px: tuple[int, int], views: int) -> list[str]:
+    found = []
+    for name, library, own in zip(
+        ("cv2.calibrateCamera of cam0", "cv2.calibrateCamera of cam1", "cv2.stereoCalibrate"),
+        stages.library_rms_px,
+        (*(one.rms_px for one in stages.alone), stages.two_stage.rms_px),
+        strict=True,
+    ):
+        if library > own * SAME_OPTIMUM + 1e-5:  # OpenCV's corners are single precision
+            found.append(f"{name} stopped early at {library:.4f} px; the optimum used here has {own:.4f} px")
+    ratio = stages.two_stage.rms_px / max(float(np.mean([one.rms_px for one in stages.alone])), 1e-9)
+    if ratio > 1.5:
+        found.append(
+            f"the stereo residual is {ratio:.1f} times that of the cameras alone: the pair moved, or the pictures "
+            "were not taken at the same instant"
+        )
+    if settings.method is Method.joint and not settings.nominal_board and views < MIN_VIEWS_FOR_PRINT:
+        found.append(f"{views} views are too few to estimate the printed corners: the nominal board was used")
+    for camera, (fx, fy, cx, cy, *_) in enumerate(stages.final.estimate.intrinsics):
+        if not (0 < cx < size_px[0] and 0 < cy < size_px[1]) or not 0.9 < fx / fy < 1.1:
+            found.append(
+                f"cam{camera} is implausible (fx {fx:.0f}, fy {fy:.0f}, cx {cx:.0f}, cy {cy:.0f} px): more views needed"
+            )
+    if stages.final.gradient > 1e-5:
+        found.append(f"the optimum was not reached to full precision (gradient {stages.final.gradient:.1e})")
+    return found
+
+
+def check_poses_differ(corners_px: Array, board: Board, size_px: tuple[int, int]) -> None:
+    """ProcessError unless the board is tilted differently in the views (V, N, 2): Zhang's method needs it."""
+    focal = 1.2 * max(size_px)  # a guess is enough: equal views stay equal with any focal length
+    K = np.array([[focal, 0, size_px[0] / 2], [0, focal, size_px[1] / 2], [0, 0, 1.0]])
+    plane = np.column_stack([board.points_m, np.zeros(board.corners)])
+    turns = [cv2.solvePnP(plane, view, K, None)[1].ravel() for view in corners_px]
+    normals = np.array([rotation_matrix(turn)[:, 2] for turn in turns])
+    spread_deg = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0)).max()))
+    if spread_deg < MIN_TILT_DEG:
+        raise ProcessError(
+            f"the board is held the same way in all {len(corners_px)} views (normals within {spread_deg:.1f} deg): "
+            "take views with the board tilted by 20 to 40 deg in different directions"
+        )
+
+
+def calibration_covariance_m2(pair: StereoPair, points_cam0: Array) -> Array:
+    """Covariance (N, 3, 3) of triangulated points (N, 3), cam0's frame, from the calibration's own uncertainty.
+
+    NaN if the pair has no covariance. To first order, for triangulation that minimises reprojection errors:
+    dX/dθ = −(AᵀA)⁻¹AᵀB with A, B the pixels' derivatives by the point and by the parameters.
+    """
+    points = np.asarray(points_cam0, np.float64).reshape(-1, 3)
+    if pair.covariance is None:
+        return np.full((len(points), 3, 3), np.nan)
+    by_parameters = np.empty((len(points), 4, 24))
+    values = pair.parameters
+    for index in range(24):
+        step = 1e-6 * max(1.0, abs(values[index]))
+        shift = np.eye(24)[index] * step
+        ahead, behind = (_pixels(pair.with_parameters(values + sign * shift), points) for sign in (1, -1))
+        by_parameters[:, :, index] = (ahead - behind) / (2 * step)
+    R = pair.T_cam1_cam0[:3, :3]
+    by_point = np.concatenate(
+        [
+            pair.cam0.project_with_jacobian(points)[1],
+            pair.cam1.project_with_jacobian(points @ R.T + pair.T_cam1_cam0[:3, 3])[1] @ R,
+        ],
+        axis=1,
+    )
+    response = -np.linalg.pinv(by_point) @ by_parameters
+    return np.asarray(response @ pair.covariance @ response.transpose(0, 2, 1))
+
+
+def _pixels(pair: StereoPair, points: Array) -> Array:
+    in_cam1 = points @ pair.T_cam1_cam0[:3, :3].T + pair.T_cam1_cam0[:3, 3]
+    return np.concatenate([pair.cam0.project(points), pair.cam1.project(in_cam1)], axis=1)
