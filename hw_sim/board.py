@@ -19,6 +19,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from capture.errors import SimulationError
 from hw_sim import optics
 from hw_sim.render import Pixels, expose
 from hw_sim.world import CameraTruth, World, nominal_pose, rotation
@@ -71,12 +72,15 @@ def board_poses(world: World, side: str) -> Array:
     """Poses ``T_body_board`` (n, 4, 4) of one pair's session: near to far, tilted, wholly in view of both cameras.
 
     Each pose is the one of many random ones that covers most of the images that no earlier pose has covered.
+
+    Raises:
+        SimulationError: the board is too large to be in view of both.
     """
     rng = np.random.default_rng([world.seed, 0xB05E, *side.encode()])
     pair = [world.camera(side, name) for name in ("cam0", "cam1")]
     nominal = nominal_pose(world.mount, side, "cam0")[:3, :3]
     nearest = 0.45
-    farthest = max(min(1.6, pair[0].fx * world.board.square_m / 10.0), 1.5 * nearest)
+    farthest = max(min(1.6, pair[0].fx * world.board.square_m / 10.0), 1.05 * nearest)  # squares of 10 px
     covered = np.zeros((2, 24, 32), dtype=bool)
     poses = []
     for distance in np.geomspace(nearest, farthest, world.board.poses):
@@ -91,6 +95,8 @@ def board_poses(world: World, side: str) -> Array:
                     if found is None or gain > found[0]:
                         found = (gain, pose, cover)
             reach *= 1.05
+            if found is None and reach > 4.0:
+                raise SimulationError(f"no pose shows the whole board to both {side} cameras: use a smaller board")
         covered |= found[2]
         poses.append(found[1])
     return np.array(poses)
@@ -121,7 +127,7 @@ def _coverage(world: World, pair: list[CameraTruth], pose: Array) -> NDArray[np.
         sides = np.linalg.norm(np.roll(outline[:4], -1, axis=0) - outline[:4], axis=1)
         squares = np.tile((world.board.columns + 1, world.board.rows + 1), 2)
         facing = camera.fx * world.board.square_m / np.linalg.norm(pose[:3, 3] - optics.position_m(camera))
-        if np.min(sides / squares) < max(8.0, 0.6 * facing):  # too oblique to be told by anyone
+        if np.min(sides / squares) < 0.6 * facing:  # too oblique to be told by anyone
             return None
         cells = (optics.project(camera, inner) / size * (32, 24)).astype(int)
         cover[image, cells[:, 1], cells[:, 0]] = True

@@ -131,9 +131,9 @@ class CameraDevice:
 
     def _ticks(self, time_ns: int) -> int:
         since_ns = time_ns - self._world.epoch_ns
-        rate = self._world.sensor.tick_hz * 1e-9
-        drifted = round(since_ns * (self.camera.clock_drift_ppm * 1e-6))  # apart: the product would lose nanoseconds
-        return self.camera.clock_offset_ticks + round(since_ns * rate) + drifted
+        drift_e12 = round(self.camera.clock_drift_ppm * 1e6)  # integers: a float of today's nanoseconds has steps of 16
+        ticks_e12 = since_ns * round(self._world.sensor.tick_hz) * (10**12 + drift_e12) // 10**9
+        return self.camera.clock_offset_ticks + ticks_e12 // 10**12
 
     def _description(self) -> CameraDescription:
         sensor = self._world.sensor

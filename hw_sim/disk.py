@@ -72,6 +72,9 @@ class StallingFile:
         time.sleep(max(0.0, self._idle_at_s - time.monotonic()))
         return len(data)
 
+    def cut(self, size: int) -> None:
+        """Nothing is kept anyway."""
+
     def end_direct(self) -> None:
         """Nothing to end."""
 

@@ -37,9 +37,7 @@ def render_spots(
     world: World, spots: Spots, exposure_us: int, gain_db: float, rng: np.random.Generator, frames: int = 1
 ) -> Pixels:
     """Image (height, width) of ``spots`` before the world's background; the rounded mean of ``frames`` images."""
-    light = background_e(world, exposure_us)
-    patches = _Patches(world, spots)
-    np.add.at(light.reshape(-1), patches.index, patches.light_e)
+    light = scene_e(world, spots, exposure_us)
     if frames == 1:
         return expose(world, light, gain_db, rng)
     total = np.zeros(light.shape, dtype=np.uint32)
@@ -47,6 +45,14 @@ def render_spots(
         total += expose(world, light, gain_db, rng)
     mean: Pixels = np.rint(total / frames).astype(np.uint8)
     return mean
+
+
+def scene_e(world: World, spots: Spots, exposure_us: int) -> Light:
+    """Expected electrons (height, width) of ``spots`` before the world's background: the image before any noise."""
+    light = background_e(world, exposure_us)
+    patches = _Patches(world, spots)
+    np.add.at(light.reshape(-1), patches.index, patches.light_e)
+    return light
 
 
 def background_e(world: World, exposure_us: int, margin_px: int = 0) -> Light:

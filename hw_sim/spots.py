@@ -51,8 +51,8 @@ def row_times_ns(camera: CameraTruth, start_ns: int, exposure_us: int, rows_px: 
 def led_spots(world: World, camera: CameraTruth, leds: LedMotion, start_ns: int, exposure_us: int) -> Spots:
     """Spots of the wing's lights, then of their reflections, in the frame whose row 0 opens at ``start_ns`` (UTC).
 
-    The wing's place and the row it is seen in depend on each other; iterating from the middle row gains a factor of over
-    100 a step at the wing's speeds, so that the third is exact to 1e-5 px.
+    The wing's place and the row it is seen in depend on each other; iterating from the middle row gains a factor
+    of over 100 a step at the wing's speeds, so that the third is exact to 1e-5 px.
     """
     rows = np.full(len(leds), world.sensor.height_px / 2.0)
     for _ in range(3):

@@ -102,8 +102,8 @@ class SimulatedBoard:
         self._next_index += 1
         self._given += 1
         self._running = self._given != self._count
+        self._send(*pulse.words())  # first: whoever is told of the pulse may keep this program busy
         self._on_pulse(pulse)
-        self._send(*pulse.words())
 
     def _read(self) -> None:
         try:

@@ -1,10 +1,11 @@
 """Time to the true shape of the wing: closed-form angles, integrated along the arc so that its length is kept.
 
-The field of rotations from the unloaded to the deformed wing is ``D(s, t) = Rx(bending) · Rz(in-plane) · Ry(twist)``
-in body axes, smooth in s and the identity at the root; the section frame is ``D(s, t) · R_jig(s)`` with
-``R_jig(s) = Rx(dihedral(s)) · R_root · rot_e1(incidence)``. Being smooth across the dihedral break, it is a field that
-a beam under forces and moments can follow. The axis is the integral of the frames' e1. No beam solver is
-involved. Everything is worked out for the right wing; the left one is the mirror image.
+The field of rotations from the unloaded to the deformed wing is, in body axes and smooth in s,
+``D(s, t) = Ry(i) · Rx(bending) · Rz(in-plane) · Ry(twist) · Ry(−i)`` with the incidence i: the wing bends about its
+chord line, as one does whose spar is fifty times stiffer in its plane. The section frame is ``D(s, t) · R_jig(s)`` with
+``R_jig(s) = Rx(dihedral(s)) · R_root · rot_e1(i)``. Being smooth across the dihedral break, this is a field that a beam
+under forces and moments can follow. The axis is the integral of the frames' e1. No beam solver is involved. Everything
+is worked out for the right wing; the left one is the mirror image.
 """
 
 import math
@@ -43,6 +44,7 @@ class WingMotion:
         self.world = world
         self.side = side
         self.stations_m = np.asarray(stations_m, dtype=np.float64)
+        self._incidence = math.radians(world.wing.incidence_deg)
         self._sign = 1.0 if side == "right" else -1.0
         wing = world.wing
         inner = np.minimum(self.stations_m, wing.break_m)
@@ -66,21 +68,20 @@ class WingMotion:
         return WingState(self._integrate(angles), self._frames(angles))
 
     def _integrate(self, angles: Array) -> Array:
-        bending, twist, inplane = _angles_at(angles[..., None, :], self._node_shapes)
         d = self._node_dihedral
-        tangent = _deform(bending, twist, inplane, (np.zeros_like(d), np.cos(d), np.sin(d)))
+        turns = _angles_at(angles[..., None, :], self._node_shapes)
+        tangent = _deform(turns, self._incidence, (np.zeros_like(d), np.cos(d), np.sin(d)))
         points = np.stack([np.sum(part * self._weights, axis=-1) for part in tangent], axis=-1)
         points[..., 1] *= self._sign
         return points
 
     def _frames(self, angles: Array) -> Array:
-        bending, twist, inplane = _angles_at(angles, self._section_shapes)
+        turns = _angles_at(angles, self._section_shapes)
         c, s = np.cos(self._section_dihedral), np.sin(self._section_dihedral)
-        incidence = math.radians(self.world.wing.incidence_deg)
-        ci, si = math.cos(incidence), math.sin(incidence)
-        along = _deform(bending, twist, inplane, (np.zeros_like(c), c, s))
-        forward = _deform(bending, twist, inplane, (np.full_like(c, -ci), -s * si, c * si))
-        up = _deform(bending, twist, inplane, (np.full_like(c, si), -s * ci, c * ci))
+        ci, si = math.cos(self._incidence), math.sin(self._incidence)
+        along = _deform(turns, self._incidence, (np.zeros_like(c), c, s))
+        forward = _deform(turns, self._incidence, (np.full_like(c, -ci), -s * si, c * si))
+        up = _deform(turns, self._incidence, (np.full_like(c, si), -s * ci, c * ci))
         frames = np.stack([np.stack(np.broadcast_arrays(*column), axis=-1) for column in (along, forward, up)], axis=-1)
         if self._sign < 0:
             frames[..., 1, :] *= -1.0  # mirrored …
@@ -168,13 +169,15 @@ def _angles_at(amplitude: Array, shapes: Array) -> _Vector:
     return bending, amplitude[..., 2] * shapes[..., 2], amplitude[..., 3] * shapes[..., 3]
 
 
-def _deform(bending: Array, twist: Array, inplane: Array, vector: _Vector) -> _Vector:
-    """``Rx(bending) · Rz(inplane) · Ry(twist)`` times a vector given by its components."""
+def _deform(turns: _Vector, incidence: float, vector: _Vector) -> _Vector:
+    """``D`` times a vector given by its components."""
+    bending, twist, inplane = turns
     x, y, z = vector
-    cos, sin = np.cos(twist), np.sin(twist)
+    cos, sin = np.cos(twist - incidence), np.sin(twist - incidence)
     x, z = x * cos + z * sin, z * cos - x * sin
     cos, sin = np.cos(inplane), np.sin(inplane)
     x, y = x * cos - y * sin, x * sin + y * cos
     cos, sin = np.cos(bending), np.sin(bending)
     y, z = y * cos - z * sin, y * sin + z * cos
-    return x, y, z
+    tilt, rise = math.cos(incidence), math.sin(incidence)
+    return x * tilt + z * rise, y, z * tilt - x * rise
