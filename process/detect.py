@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from process.spot_fit import AMPLITUDE, BACKGROUND, BLUR, RADIUS, Fit, Patches, U, V, fit_spots, spot_profile
+from process.spot_fit import AMPLITUDE, BACKGROUND, BLUR, PARAMETERS, RADIUS, Fit, Patches, U, V, fit_spots, spot_light
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -17,7 +17,7 @@ Pixels = NDArray[np.uint8]
 MAX_BLOBS = 400
 """Beyond these the scene is not a dark one with lights: the largest are kept, the rest counted as rejected."""
 _STRIDE = 16  # of the sample that the background is estimated from
-_HALF_WIDTHS = (4, 6, 8, 12, 18, 28)  # patches are fitted together by size
+_HALF_WIDTHS = (5, 9, 16, 28)  # patches are fitted together by size
 _LEVELS = (0.5, 0.7, 0.85)  # of a blob's peak, where two lights that run into each other part
 _SHAPE_FLAT_PX2 = 0.15  # added to both second moments: a few pixels do not have a shape
 
@@ -132,7 +132,7 @@ def _detect_default(image: Pixels, settings: DetectSettings) -> Detections:
     scene = _scene(image, settings)
     blobs = [spot for blob in _blobs(scene) for spot in _gated(scene, *blob, settings)]
     if not blobs:
-        return _detections([], np.empty((0, 6)), np.empty((0, 2, 2)), [], scene.rejected)
+        return _detections([], np.empty((0, PARAMETERS)), np.empty((0, 2, 2)), [], scene.rejected)
     fit = _fit_all(scene, blobs, settings)
     keep = _without_bad_fits(scene, blobs, fit)
     keep = _without_reflections(scene, blobs, fit, keep, settings)
@@ -279,8 +279,8 @@ def _fit_all(scene: _Scene, blobs: list[_Blob], settings: DetectSettings) -> Fit
 
 
 def _start(scene: _Scene, blobs: list[_Blob]) -> Array:
-    """(N, 6): a blur of 0.8 px, and the disc that then has the blob's area where it crosses the threshold."""
-    start = np.empty((len(blobs), 6))
+    """(N, 8): a blur of 0.8 px, and the disc that then has the blob's area where it crosses the threshold."""
+    start = np.zeros((len(blobs), PARAMETERS))
     contrast = scene.threshold - scene.floor
     for k, blob in enumerate(blobs):
         edge = np.sqrt(blob.area / np.pi)
@@ -336,9 +336,8 @@ def _patches(
 def _light_of_others(patches: Patches, parameters: Array, members: NDArray[np.intp], near: NDArray[np.bool_]) -> Array:
     light = np.zeros_like(patches.values)
     for number, place in enumerate(members):
-        for u, v, amplitude, _, radius, blur in parameters[near[place]]:
-            rho = np.hypot(patches.u_px[number] - u, patches.v_px[number] - v)
-            light[number] += amplitude * spot_profile(rho, radius, blur)
+        others = parameters[near[place]]
+        light[number] = spot_light(others, patches.u_px[number], patches.v_px[number]).sum(axis=0)
     return light
 
 
