@@ -18,10 +18,12 @@ FEWEST_MARKERS = 3
 _ITERATIONS = 50
 _LARGEST_TURN_RAD = 0.3  # of an element in one step
 _SETTLED_SIGMA = 1e-3  # the last step in units of the loads' posterior sigma
+_NEARLY_SIGMA = 0.1  # the same, to judge which markers to believe
 _SETTLED_TURN_RAD = 1e-6  # what is missing to equilibrium in any element
 _SMALLEST_MODE = 1e-5  # of the largest mode's variance
 _ENERGY_J = 1e-3  # elastic energy of the strains that point loads at a few stations may leave unexplained
-_ROUNDS = 5  # changes of which markers are in
+_HUBER = 3.0  # sigmas
+_ROUNDS = 10  # changes of which markers are in
 _MEDIAN_DISTANCE = 1.538  # median length of a standard normal 3-vector
 
 
@@ -109,7 +111,8 @@ def fit_frame(
             settle from it, it begins again from the unloaded wing: divergence cannot travel from frame to frame.
 
     Returns:
-        the fit; with NaN and a reason when fewer than three markers were measured or the iteration does not settle.
+        the fit; with NaN and a reason when fewer than three markers were measured, the iteration does not settle, or
+        less than half of the markers agree with it.
     """
     problem = _pose(half, marker_xyz_m, marker_cov_m2, settings)
     stations = np.array(settings.load_stations_m)
@@ -119,11 +122,11 @@ def fit_frame(
     state = None
     if start is not None and start.converged and len(start.unknowns) == problem.unknowns:
         state = _iterate(problem, start.strain, start.unknowns)
-    if state is None or not state.settled:
-        before = state.iterations if state is not None else 0
+    if state is None or _objection(problem, state):
         state = _iterate(problem, np.zeros((half.beam.elements, 4)), np.zeros(problem.unknowns))
-        if not state.settled:
-            return _failed(half, stations, before + state.iterations, f"did not settle in {_ITERATIONS} iterations")
+        objection = _objection(problem, state)
+        if objection:
+            return _failed(half, stations, state.iterations, objection)
     return _result(problem, state, stations)
 
 
@@ -178,8 +181,9 @@ def _strain_modes(half: HalfWing, settings: FitSettings) -> Array:
 def _iterate(problem: _Problem, strain: Array, theta: Array) -> _State:
     """Gauss–Newton on loads and equilibrium at once: one Newton correction of the strains a step (eqs. 18 to 20).
 
-    Markers are weighed down smoothly while the iteration runs (their scale is the median's, so that a wing far from
-    its start is not taken for outliers) and in the end are in or out.
+    While the iteration runs a marker's pull is bounded (Huber; the scale is the median's, so that a wing far from its
+    start is not taken for outliers). That cost has one minimum, so no start can lock the wrong markers in. Then each
+    marker is in or out.
     """
     length = np.repeat(problem.half.beam.length_m, 4)
     decided: Array | None = None
@@ -201,9 +205,10 @@ def _iterate(problem: _Problem, strain: Array, theta: Array) -> _State:
         if not np.isfinite(turn):
             break
         imbalance = float(np.abs(linear.correction * length).max())
-        if np.sqrt(change @ normal @ change) < _SETTLED_SIGMA and imbalance < _SETTLED_TURN_RAD:
+        enough = _NEARLY_SIGMA if decided is None else _SETTLED_SIGMA
+        if np.sqrt(change @ normal @ change) < enough and imbalance < _SETTLED_TURN_RAD:
             verdict = _verdict(problem, linear.distance)
-            if np.array_equal(verdict, weight) or rounds == _ROUNDS:
+            if decided is not None and (np.array_equal(verdict, weight) or rounds == _ROUNDS):
                 return _State(True, iteration, theta, linear, weight, factor, information)
             decided = verdict
             rounds += 1
@@ -211,6 +216,16 @@ def _iterate(problem: _Problem, strain: Array, theta: Array) -> _State:
         strain = strain + damping * step.reshape(-1, 4)
         theta = theta + damping * change
     return _State(False, iteration, theta, linear, weight, information, information)
+
+
+def _objection(problem: _Problem, state: _State) -> str:
+    """Why a state is not the wing's shape; empty when it is."""
+    if not state.settled:
+        return f"did not settle in {_ITERATIONS} iterations"
+    agree, seen = int(np.sum(state.weight > 0)), int(problem.seen.sum())
+    if agree < max(FEWEST_MARKERS, seen / 2):
+        return f"only {agree} of {seen} markers agree on one shape of the wing"
+    return ""
 
 
 def _linearise(problem: _Problem, strain: Array, theta: Array) -> _Linear:
@@ -244,8 +259,8 @@ def _scale(problem: _Problem, distance: Array) -> float:
 
 
 def _weight(problem: _Problem, distance: Array) -> Array:
-    limit = problem.outlier_sigma * _scale(problem, distance)
-    return np.where(problem.seen, (limit / np.maximum(distance, limit)) ** 2, 0.0)
+    limit = _HUBER * _scale(problem, distance)
+    return np.where(problem.seen, limit / np.maximum(distance, limit), 0.0)
 
 
 def _verdict(problem: _Problem, distance: Array) -> Array:
@@ -287,12 +302,14 @@ def _marker_points(half: HalfWing, shape: Shape) -> Array:
 
 def _result(problem: _Problem, state: _State, stations: Array) -> Fit:
     half, shape = problem.half, state.linear.shape
-    covariance = state.factor.T @ state.factor
-    spin, slide = state.linear.spin @ state.factor.T, state.linear.slide @ state.factor.T
+    used = state.weight > 0
+    chi2 = float(np.sum(state.linear.distance[used] ** 2))
+    dof = float(3 * used.sum() - np.sum((state.factor.T @ state.factor) * state.information))
+    factor = state.factor * np.sqrt(max(1.0, chi2 / dof))  # a misfit widens the bands (Birge's ratio)
+    spin, slide = state.linear.spin @ factor.T, state.linear.slide @ factor.T
     moves = slide + hat(shape.position_m).transpose(0, 2, 1) @ spin
     twists = (twist_gradient(half, shape.R_body_section)[:, None, :] @ spin)[:, 0, :]
-    loads, load_covariance = _station_loads(problem, state)
-    used = state.weight > 0
+    loads, load_covariance = _station_loads(problem, state, factor)
     measured = problem.seen[:, None]
     return Fit(
         converged=True,
@@ -312,12 +329,12 @@ def _result(problem: _Problem, state: _State, stations: Array) -> Fit:
         distance=np.where(problem.seen, state.linear.distance, np.nan),
         outlier=problem.seen & ~used,
         used=used,
-        chi2=float(np.sum(state.linear.distance[used] ** 2)),
-        dof=float(3 * used.sum() - np.sum(covariance * state.information)),
+        chi2=chi2,
+        dof=dof,
     )
 
 
-def _station_loads(problem: _Problem, state: _State) -> tuple[Array, Array]:
+def _station_loads(problem: _Problem, state: _State, factor: Array) -> tuple[Array, Array]:
     """Loads (k, 6) at the stations and their covariance (6k, 6k).
 
     Where loads act at every node, those point loads at the stations whose strains come closest, in elastic energy, to
@@ -325,7 +342,7 @@ def _station_loads(problem: _Problem, state: _State) -> tuple[Array, Array]:
     """
     sigma = problem.load_sigma
     if problem.modes is None:
-        covariance = state.factor.T @ state.factor
+        covariance = factor.T @ factor
         return (sigma * state.theta).reshape(-1, 6), np.outer(sigma, sigma) * covariance
     beam, shape = problem.half.beam, state.linear.shape
     unit = _unit_forces(problem, shape)
@@ -333,7 +350,7 @@ def _station_loads(problem: _Problem, state: _State) -> tuple[Array, Array]:
     normal = unit.T @ flexible.reshape(unit.shape) / _ENERGY_J + np.diag(sigma**-2.0)
     undetermined = np.linalg.inv(normal)
     gain = undetermined @ unit.T / _ENERGY_J
-    spread = gain @ problem.modes @ state.factor.T
+    spread = gain @ problem.modes @ factor.T
     return (gain @ shape.strain.ravel()).reshape(-1, 6), spread @ spread.T + undetermined
 
 

@@ -124,11 +124,14 @@ def read_wing(path: Path, nodes_at_m: tuple[float, ...] = ()) -> Wing:
 def build_wing(described: WingFile, nodes_at_m: tuple[float, ...] = ()) -> Wing:
     """The two half wings of a checked description."""
     sigma = described.stiffness_sigma
+    stations = [pair.station_m for pair in described.markers.pairs] + [mass.station_m for mass in described.mass]
+    stations += [*(described.fit.load_stations_m if described.fit else ()), *nodes_at_m]
+    segments, lengths = _mesh(described.segment, stations)
     return Wing(
         name=described.name,
-        left=_half(described, "left", nodes_at_m),
-        right=_half(described, "right", nodes_at_m),
-        fit=described.fit_settings,
+        left=_half(described, segments, lengths, "left"),
+        right=_half(described, segments, lengths, "right"),
+        fit=described.fit or FitSettings(load_stations_m=_thirds(lengths)),
         stiffness_sigma=np.array([sigma.EA, sigma.GJ, sigma.EI_out, sigma.EI_in]),
     )
 
@@ -165,13 +168,9 @@ def _level(half: HalfWing, R_body_section: Array) -> tuple[Array, Array, Array, 
     return t, f0, half.sign * cross(t, f0), length
 
 
-def _half(described: WingFile, side: Side, nodes_at_m: tuple[float, ...]) -> HalfWing:
+def _half(described: WingFile, segments: list[SegmentSection], lengths: Array, side: Side) -> HalfWing:
     sign = 1.0 if side == "right" else -1.0
     mirror = np.ones(4) if side == "right" else _MIRROR
-    wanted = [pair.station_m for pair in described.markers.pairs]
-    wanted += [mass.station_m for mass in described.mass]
-    wanted += [*described.fit_settings.load_stations_m, *nodes_at_m]
-    segments, lengths = _mesh(described.segment, wanted)
     node_s = np.concatenate([[0.0], np.cumsum(lengths)])
     beam = Beam(
         length_m=lengths,
@@ -217,6 +216,12 @@ def _mesh(described: tuple[SegmentSection, ...], stations_m: list[float]) -> tup
             lengths += [(b - a) / count] * count
         start = end
     return segments, np.array(lengths)
+
+
+def _thirds(lengths: Array) -> tuple[float, ...]:
+    """The nodes nearest to the thirds of the half span: where loads are reported when the file does not say."""
+    outboard = np.cumsum(lengths)
+    return tuple(sorted({float(outboard[np.argmin(np.abs(outboard - outboard[-1] * i / 3))]) for i in (1, 2, 3)}))
 
 
 def _orientation(described: WingFile, segment: SegmentSection, side: Side) -> Array:

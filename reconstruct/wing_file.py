@@ -156,12 +156,6 @@ class WingFile(Strict):
     fit: FitSettings | None = None
 
     @property
-    def fit_settings(self) -> FitSettings:
-        """The [fit] table, or its defaults with loads at thirds of the half span."""
-        thirds = tuple(self.semispan_m * i / 3 for i in (1, 2, 3))
-        return self.fit or FitSettings(load_stations_m=thirds)
-
-    @property
     def semispan_m(self) -> float:
         """Arc length of the half wing."""
         return sum(segment.length_m for segment in self.segment)
