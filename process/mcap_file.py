@@ -77,7 +77,7 @@ def index_file(path: Path) -> FileIndex:
         with _Descriptor(path) as descriptor:
             chunks = _chunks_of_summary(path, channels)
             if chunks is None:
-                chunks = _chunks_by_scanning(path, descriptor, index.problems)
+                chunks = _chunks_by_scanning(path, descriptor, channels, index.problems)
             for at, size in chunks:
                 try:
                     index.messages.extend(_messages_of_chunk(str(path), descriptor, at, size, channels))
@@ -144,8 +144,13 @@ def _chunks_of_summary(path: Path, channels: dict[int, str]) -> list[tuple[int, 
     return sorted(chunks)
 
 
-def _chunks_by_scanning(path: Path, descriptor: int, problems: list[str]) -> list[tuple[int, int]]:
-    """(offset, size) of the complete chunks of a file without summary; says in ``problems`` what is wrong with it."""
+def _chunks_by_scanning(
+    path: Path, descriptor: int, channels: dict[int, str], problems: list[str]
+) -> list[tuple[int, int]]:
+    """(offset, size) of the complete chunks of a file without summary; says in ``problems`` what is wrong with it.
+
+    Channels declared between the chunks are added to ``channels``.
+    """
     end = os.fstat(descriptor).st_size
     if os.pread(descriptor, len(MAGIC), 0) != MAGIC:
         problems.append(f"{path}: not an MCAP file")
@@ -158,6 +163,8 @@ def _chunks_by_scanning(path: Path, descriptor: int, problems: list[str]) -> lis
             break
         if opcode == CHUNK:
             chunks.append((at, _HEAD.size + length))
+        elif opcode == CHANNEL:
+            _add_channel(os.pread(descriptor, min(_HEAD.size + length, _LONGEST_HEAD), at), channels)
         at += _HEAD.size + length
     problems.append(
         f"{path}: no summary (the recording was cut); read up to byte {at} of {end}, {len(chunks)} chunks"
@@ -202,10 +209,16 @@ def _messages_of_chunk(
                 start = os.pread(descriptor, wanted, at + head.records_at + offset)
             else:
                 start = bytes(records[offset : offset + wanted])
-            identity, _, name_size = struct.unpack_from("<HHI", start, _HEAD.size)
-            name_at = _HEAD.size + 8
-            channels[identity] = start[name_at : name_at + name_size].decode(errors="replace")
+            _add_channel(start, channels)
         offset += _HEAD.size + length
+
+
+def _add_channel(record: bytes, channels: dict[int, str]) -> None:
+    if len(record) < _HEAD.size + 8:
+        return  # not a channel that a message could be on
+    identity, _, name_size = struct.unpack_from("<HHI", record, _HEAD.size)
+    name_at = _HEAD.size + 8
+    channels[identity] = record[name_at : name_at + name_size].decode(errors="replace")
 
 
 def _chunk_head(start: bytes | memoryview, size: int) -> _ChunkHead:

@@ -1,15 +1,18 @@
 """The recording reader against the stock ``mcap`` writer and reader, whole, cut and corrupted."""
 
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Header, Message, Schema
 from mcap.writer import CompressionType
 
 from capture.errors import ProcessError
-from capture.record import LOSS_TOPIC, Loss, decode_image
-from process.mcap_file import index_file
+from capture.record import LOSS_TOPIC, SCHEMAS, Frame, Loss, decode_image, image_prefix
+from process.mcap_file import MAGIC, index_file
 from process.recording import open_recording
 
 START_NS = 1_700_000_000_000_000_000
@@ -163,6 +166,34 @@ def test_padding_records_between_chunks_are_skipped(tmp_path, recording_writer):
     header_end = 8 + 9 + int.from_bytes(data[9:17], "little")
     path.write_bytes(data[:header_end] + padding + data[header_end:] + padding)
     assert len(open_recording([path]).sides["left"]) == 2
+
+
+@pytest.mark.parametrize("share", [0.97, 0.5])
+def test_the_recorders_own_file_cut_short(tmp_path, recording_writer, share):
+    """Its channels are declared before the chunks, not in them; each chunk holds an image and what is known of it."""
+    path = tmp_path / "right_0000.mcap"
+    out = RecordBuilder()
+    out.write(MAGIC)
+    Header("ros2", "test").write(out)
+    for identity, schema in ((1, "sensor_msgs/msg/Image"), (2, "wingshape_msgs/msg/Frame")):
+        Schema(identity, SCHEMAS[schema].encode(), "ros2msg", schema).write(out)
+    Channel(1, "/right/cam1/image_raw", "cdr", {}, 1).write(out)
+    Channel(2, "/right/cam1/frame", "cdr", {}, 2).write(out)
+    for trigger in range(10):
+        image = image_prefix(START_NS, "cam1", 24, 32) + picture(trigger, 1).tobytes()
+        frame = Frame(trigger, 0, 0, 0, START_NS, 0, 0, 2000, 10_000, 0, 0, 0.0, 0, 0).encode()
+        records = RecordBuilder()
+        for channel, data in ((1, image), (2, frame)):
+            Message(channel, 0, data, START_NS, trigger).write(records)
+        inside = records.end()
+        Chunk("", inside, 0, 0, zlib.crc32(inside), len(inside)).write(out)
+    data = out.end()
+    path.write_bytes(data[: int(share * len(data))])
+    sets = list(open_recording([path]).frame_sets("right"))
+    assert abs(len(sets) - 10 * share) <= 1
+    for frame_set in sets:
+        np.testing.assert_array_equal(frame_set.images[1], picture(frame_set.trigger_index, 1))
+        assert frame_set.frames[1].trigger_index == frame_set.trigger_index
 
 
 def test_images_of_another_recorder_are_grouped_by_stamp(tmp_path, recording_writer):
