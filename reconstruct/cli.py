@@ -1,6 +1,7 @@
 """The ``reconstruct`` command: flights and marker tables to wing shapes, and results to reports."""
 
 import shlex
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from reconstruct.result import COMPARISON, REPORT, read_result
 from reconstruct.run import Job, Progress, run_comparison, run_job
 from reconstruct.static import static
 from reconstruct.summary import verdict
+from reconstruct.wing import example_path
 
 SHOWN_WARNINGS = 20
 
@@ -123,6 +125,20 @@ def report_command(
 
 
 app.command("static")(static)
+
+
+@app.command("example")
+def example_command(
+    name: Annotated[str, typer.Argument(help="xhale or pazy.")],
+    out: Annotated[Path, typer.Option("--output", "-o", help="The wing file to write.")],
+) -> None:
+    """Write a shipped wing file, to start your own from."""
+    source = example_path(f"{name}.toml")
+    if not source.is_file():
+        known = ", ".join(sorted(path.stem for path in source.parent.glob("*.toml")))
+        raise UsageError(f"no example {name!r}; there are {known}")
+    shutil.copyfile(source, out)
+    say(str(out))
 
 
 def main() -> None:

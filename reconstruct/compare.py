@@ -1,5 +1,6 @@
 """A result folder and a reference folder (truth, simulation, another result) → the errors of the result."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from reconstruct.tables import (
     MarkerSeries,
     ShapeSeries,
     marker_series,
+    marker_tracks,
     read_table,
     shape_series,
 )
@@ -63,18 +65,13 @@ def compare(result: Path, reference: Path) -> Comparison:
     for folder in (result, reference):
         if not folder.is_dir():
             raise UsageError(f"{folder}: no such folder; give a result of `reconstruct run` and a reference like it")
-    shapes = [shape_series(read_table(folder / SHAPE, ()), str(folder / SHAPE)) for folder in (result, reference)]
-    markers = [
-        marker_series(read_table(folder / MARKERS, ()), str(folder / MARKERS), covariance=False)
-        for folder in (result, reference)
-    ]
-    sides = [side for side in shapes[0] if side in shapes[1]]
-    shape = [_shape_errors(shapes[0][side], shapes[1][side], str(reference / SHAPE)) for side in sides]
-    marker = [
-        _marker_errors(markers[0][side], markers[1][side], str(reference / MARKERS))
-        for side in markers[0]
-        if side in markers[1]
-    ]
+    shape_file, marker_file = str(reference / SHAPE), str(reference / MARKERS)
+    shapes = shape_series(read_table(result / SHAPE, ()), str(result / SHAPE))
+    true_shapes = shape_series(read_table(reference / SHAPE, ()), shape_file, reference=True)
+    shape = [_shape_errors(shapes[side], true_shapes[side], shape_file) for side in shapes if side in true_shapes]
+    markers = marker_series(read_table(result / MARKERS, ()), str(result / MARKERS))
+    tracks = marker_tracks(read_table(reference / MARKERS, ()), marker_file)
+    marker = [_marker_errors(markers[side], tracks[side], marker_file) for side in markers if side in tracks]
     if not any(np.isfinite(errors.xyz_m).any() for errors in shape):
         raise UsageError(
             f"{reference}: has no set at the time of a fitted set of {result}; are both of the same flight?"
@@ -93,7 +90,7 @@ def interpolate_shape(series: ShapeSeries, timestamp_ns: Ints, s_m: Floats, name
     """Positions (F, S, 3) in m and twist (F, S) in degrees of ``series`` at other instants and stations.
 
     Cubic splines in time, then along the span; NaN outside of either, and in gaps of the time. ``name`` is for
-    UsageError, raised when the series has fewer than two sets or its time does not grow.
+    UsageError, raised when the series has fewer than two sets.
     """
     state = np.concatenate([series.xyz_m, series.twist_deg[..., None]], axis=-1)
     whole = np.isfinite(state).all(axis=(1, 2))
@@ -113,8 +110,6 @@ def _in_time(sample_ns: Ints, samples: Floats, wanted_ns: Ints, name: str) -> Fl
     if sample_ns.size < 2:
         raise UsageError(f"{name}: needs at least two sets in time (write a wing at rest twice)")
     step = np.diff(sample_ns)
-    if np.any(step <= 0):
-        raise UsageError(f"{name}: timestamp_ns must grow with trigger_index")
     inside = (wanted_ns >= sample_ns[0]) & (wanted_ns <= sample_ns[-1])
     interval = np.clip(np.searchsorted(sample_ns, wanted_ns, side="right") - 1, 0, step.size - 1)
     inside &= step[interval] <= REFERENCE_GAP * np.median(step)
@@ -131,19 +126,12 @@ def _shape_errors(result: ShapeSeries, reference: ShapeSeries, name: str) -> _Sh
     return _ShapeErrors(result, np.asarray(inside), result.xyz_m - xyz, result.twist_deg - twist)
 
 
-def _marker_errors(result: MarkerSeries, reference: MarkerSeries, name: str) -> _MarkerErrors:
+def _marker_errors(result: MarkerSeries, tracks: Mapping[int, tuple[Ints, Floats]], name: str) -> _MarkerErrors:
     true = np.full_like(result.xyz_m, np.nan)
     for column, marker in enumerate(result.marker):
-        at = np.flatnonzero(reference.marker == marker)
-        if at.size == 0:
-            continue
-        known = reference.seen[:, at[0]]
-        true[:, column] = _in_time(
-            reference.timestamp_ns[known, at[0]],
-            reference.xyz_m[known, at[0]],
-            result.timestamp_ns[:, column],
-            f"{name}: {result.side} wing, marker {marker}",
-        )
+        if int(marker) in tracks:
+            place = f"{name}: {result.side} wing, marker {marker}"
+            true[:, column] = _in_time(*tracks[int(marker)], result.timestamp_ns[:, column], place)
     return _MarkerErrors(result, np.asarray(np.isfinite(true).all(axis=-1)), result.xyz_m - true)
 
 

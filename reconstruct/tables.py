@@ -94,44 +94,70 @@ def check_columns(table: pa.Table, required: Sequence[str], name: str) -> None:
         raise UsageError(f"{name}: has no rows")
 
 
-def marker_series(table: pa.Table, name: str, *, covariance: bool = True) -> dict[str, MarkerSeries]:
-    """The marker table as dense arrays by side, sides without rows left out.
+def marker_series(table: pa.Table, name: str) -> dict[str, MarkerSeries]:
+    """A measurement's marker table as dense arrays by side, sides without rows left out.
 
-    ``covariance`` False: the covariances and the common instant may be missing (a reference). Raises UsageError when
-    columns are missing, a side is neither left nor right, a marker occurs twice in a set, or the markers of one
-    set do not agree on their common instant.
+    Raises UsageError when columns are missing, a side is neither left nor right, a marker occurs twice in a set, or the
+    markers of one set do not agree on their common instant.
     """
-    required = ("trigger_index", "side", "marker", "timestamp_ns", *POSITION)
-    check_columns(table, (*required, "frame_timestamp_ns", *COVARIANCE) if covariance else required, name)
-    own_times = "frame_timestamp_ns" not in table.column_names
+    required = ("trigger_index", "side", "marker", "timestamp_ns", "frame_timestamp_ns", *POSITION, *COVARIANCE)
+    check_columns(table, required, name)
     rows = {
         "marker": _ints(table, "marker", name),
         "time": _ints(table, "timestamp_ns", name),
-        "frame_time": _ints(table, "timestamp_ns" if own_times else "frame_timestamp_ns", name),
+        "frame_time": _ints(table, "frame_timestamp_ns", name),
         "xyz": _stack(table, POSITION, name),
         "cov": _stack(table, COVARIANCE, name),
         "flags": _words(table, "flags"),
     }
     series = {}
-    for side, pick, frame_of, triggers in _by_side(table, name):
+    for side, pick in _by_side(table, name):
+        triggers, frame_of = np.unique(_ints(table, "trigger_index", name)[pick], return_inverse=True)
         own = {key: values[pick] for key, values in rows.items()}
-        series[side] = _dense_markers(side, triggers, frame_of, own, name, check_instant=not own_times)
+        series[side] = _dense_markers(side, triggers, frame_of, own, name)
     return series
 
 
-def shape_series(table: pa.Table, name: str) -> dict[str, ShapeSeries]:
-    """The shape table as dense arrays by side, sides without rows left out.
+def marker_tracks(table: pa.Table, name: str) -> dict[str, dict[int, tuple[Ints, Floats]]]:
+    """A reference's marker table as the path of each marker: side → marker → times (n,) in ns, growing, and (n, 3).
 
-    Sigmas and flags may be missing (a reference). Raises UsageError when columns are missing, a station is missing or
-    occurs twice in a set, or the arc length of a station or the time of a set is not the same in all of its rows.
+    Sets and measurement columns are not needed, unknown positions are left out. Raises UsageError when columns are
+    missing, a side is neither left nor right, or a marker is twice at one time.
     """
-    check_columns(table, ("trigger_index", "side", "timestamp_ns", "station", "s_m", *POSITION, "twist_deg"), name)
+    check_columns(table, ("side", "marker", "timestamp_ns", *POSITION), name)
+    marker, time = _ints(table, "marker", name), _ints(table, "timestamp_ns", name)
+    xyz = _stack(table, POSITION, name)
+    known = np.asarray(np.isfinite(xyz).all(axis=1))
+    tracks: dict[str, dict[int, tuple[Ints, Floats]]] = {}
+    for side, pick in _by_side(table, name):
+        rows = pick[known[pick]]
+        rows = rows[np.lexsort((time[rows], marker[rows]))]
+        tracks[side] = {}
+        for own in np.split(rows, np.flatnonzero(np.diff(marker[rows])) + 1) if rows.size else []:
+            if np.any(np.diff(time[own]) == 0):
+                raise UsageError(f"{name}: {side} wing: marker {marker[own[0]]} is twice at one timestamp_ns")
+            tracks[side][int(marker[own[0]])] = (time[own], xyz[own])
+    return tracks
+
+
+def shape_series(table: pa.Table, name: str, *, reference: bool = False) -> dict[str, ShapeSeries]:
+    """The shape table as dense arrays by side, sides without rows left out; sigmas and flags may be missing.
+
+    With ``reference`` the rows of one time are a set, whatever their trigger index, which is then the set's number.
+    Raises UsageError when columns are missing, a station is missing or occurs twice in a set, or the arc length of a
+    station or the time of a set is not the same in all of its rows.
+    """
+    required = ("side", "timestamp_ns", "station", "s_m", *POSITION, "twist_deg")
+    check_columns(table, required if reference else ("trigger_index", *required), name)
     station, time = _ints(table, "station", name), _ints(table, "timestamp_ns", name)
     s_m, xyz = _stack(table, ("s_m",), name)[:, 0], _stack(table, POSITION, name)
     sigmas = _stack(table, (*SIGMA, "sigma_twist_deg"), name)
     twist, flags = _stack(table, ("twist_deg",), name)[:, 0], _words(table, "flags")
     series = {}
-    for side, pick, frame_of, triggers in _by_side(table, name):
+    for side, pick in _by_side(table, name):
+        key = time if reference else _ints(table, "trigger_index", name)
+        sets, frame_of = np.unique(key[pick], return_inverse=True)
+        triggers = np.arange(sets.size) if reference else sets
         stations, station_of = np.unique(station[pick], return_inverse=True)
         shape = (triggers.size, stations.size)
         order = _positions(frame_of, station_of, shape, f"{name}: {side} wing", "station")
@@ -169,31 +195,23 @@ def write_csv(table: pa.Table, path: Path) -> None:
     pyarrow.csv.write_csv(table, path)
 
 
-def _by_side(table: pa.Table, name: str) -> list[tuple[str, Ints, Ints, Ints]]:
-    """(side, its row numbers, the set of each of these rows, the sets' trigger indices) for each side present."""
+def _by_side(table: pa.Table, name: str) -> list[tuple[str, npt.NDArray[np.intp]]]:
+    """(side, its row numbers) for each side present."""
     side = _words(table, "side")
-    strange = sorted({str(value) for value in np.unique(side)} - set(SIDES))
+    strange = sorted(set(side) - set(SIDES))
     if strange:
         raise UsageError(f"{name}: side is {strange[0]!r}, not left or right")
-    trigger = _ints(table, "trigger_index", name)
-    found = []
-    for which in SIDES:
-        pick = np.flatnonzero(side == which)
-        if pick.size:
-            triggers, frame_of = np.unique(trigger[pick], return_inverse=True)
-            found.append((which, pick, frame_of.astype(np.int64), triggers))
-    return found
+    rows = [(which, np.flatnonzero(side == which)) for which in SIDES]
+    return [(which, pick) for which, pick in rows if pick.size]
 
 
-def _dense_markers(
-    side: str, triggers: Ints, frame_of: Ints, rows: Mapping[str, Any], name: str, *, check_instant: bool
-) -> MarkerSeries:
+def _dense_markers(side: str, triggers: Ints, frame_of: Ints, rows: Mapping[str, Any], name: str) -> MarkerSeries:
     markers, marker_of = np.unique(rows["marker"], return_inverse=True)
     shape = (triggers.size, markers.size)
     _positions(frame_of, marker_of, shape, f"{name}: {side} wing", "marker")
     last = np.full(triggers.size, np.iinfo(np.int64).min)
     np.maximum.at(last, frame_of, rows["frame_time"])
-    if check_instant and np.any(rows["frame_time"] != last[frame_of]):
+    if np.any(rows["frame_time"] != last[frame_of]):
         raise UsageError(f"{name}: {side} wing: the markers of a set must share one frame_timestamp_ns")
     time = np.repeat(last[:, None], markers.size, axis=1)
     xyz = np.full((*shape, 3), np.nan)
@@ -211,7 +229,7 @@ def _dense_markers(
 def _positions(frame_of: Ints, item_of: Ints, shape: tuple[int, int], name: str, what: str) -> Ints:
     """Flat positions of the rows in a dense array of ``shape``; raises UsageError when two rows share one."""
     order = frame_of * shape[1] + item_of
-    if np.unique(order).size != order.size:
+    if np.bincount(order).max() > 1:
         raise UsageError(f"{name}: a {what} occurs twice in one set")
     return np.asarray(order, dtype=np.int64)
 

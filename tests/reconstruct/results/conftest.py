@@ -140,8 +140,10 @@ class BendingWing:
     def reference(self, folder: Path, times_s: np.ndarray) -> Path:
         """A reference folder, densely sampled at ``times_s``; every marker at the common instant."""
         folder.mkdir(parents=True, exist_ok=True)
-        pyarrow.parquet.write_table(self.shape_table(times_s), folder / "shape.parquet")
-        pyarrow.parquet.write_table(self.marker_table(times_s, row_offset_s=0.0), folder / "markers.parquet")
+        markers = self.marker_table(times_s, row_offset_s=0.0)
+        for name, table in (("shape", self.shape_table(times_s)), ("markers", markers)):
+            untriggered = table.set_column(0, "trigger_index", pa.array(np.full(table.num_rows, -1)))
+            pyarrow.parquet.write_table(untriggered, folder / f"{name}.parquet")
         return folder
 
 

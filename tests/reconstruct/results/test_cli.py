@@ -121,10 +121,26 @@ def test_compare_and_report(out: Path, bending_wing: Any, tmp_path: Path) -> Non
     assert "Error against the reference" in (out / "report.html").read_text()
 
 
+def test_a_result_is_a_reference_too(out: Path, tmp_path: Path) -> None:
+    done = reconstruct("compare", out, out, "-o", tmp_path / "compared", "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert said["frames_compared"] == 12
+    assert said["shape_rms_mm"] < 1e-6
+    assert said["marker_rms_mm"] < 1e-6
+
+
+def test_example_is_a_wing_file(tmp_path: Path) -> None:
+    done = reconstruct("example", "xhale", "-o", tmp_path / "wing.toml")
+    assert done.returncode == 0, done.stderr
+    assert read_wing(tmp_path / "wing.toml").left.marker_ids.size == 18
+    assert "xhale" in error_line(reconstruct("example", "albatross", "-o", tmp_path / "other.toml"), 2)
+
+
 def test_help_lists_the_commands() -> None:
     done = reconstruct("--help")
     assert done.returncode == 0
-    for name in ("run", "compare", "report", "static"):
+    for name in ("run", "compare", "report", "static", "example"):
         assert f" {name} " in done.stdout
 
 
@@ -163,7 +179,7 @@ class TestErrors:
     def test_a_table_with_other_columns(self, wing_file: Path, tmp_path: Path) -> None:
         pq.write_table(pa.table({"side": ["left"], "trigger_index": [1]}), tmp_path / "markers.parquet")
         done = reconstruct("--markers", tmp_path / "markers.parquet", "--wing", wing_file, "-o", tmp_path / "out")
-        assert "lacks the columns marker, timestamp_ns, x_m" in error_line(done, 2)
+        assert "lacks the columns marker, timestamp_ns, frame_timestamp_ns, x_m" in error_line(done, 2)
 
     def test_all_markers_missing(self, bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
         pq.write_table(bending_wing().marker_table(np.arange(3) * 0.04, missing=1.0), tmp_path / "markers.parquet")
