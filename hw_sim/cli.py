@@ -1,5 +1,7 @@
 """``wingsim``: worlds, calibration sessions, the rig that stands in for the hardware, truth and the demonstration."""
 
+import contextlib
+import os
 import signal
 import threading
 from pathlib import Path
@@ -75,6 +77,8 @@ def rig(
     known = World.read(world)
     if truth is not None:
         clear_truth(truth)
+    with contextlib.suppress(OSError):  # real hardware does not wait for the host's other work; take what is allowed
+        os.nice(-10)
     asked = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: asked.set())

@@ -72,6 +72,7 @@ class CameraDevice:
         self._exposure_us, self._gain_db = request.exposure_us, request.gain_db
         noise = self._noise(request.exposure_us, request.gain_db)
         self._renderer = LiveRenderer(self._world, self.camera, noise, request.exposure_us, request.gain_db)
+        self._renderer.render(self._world.epoch_ns, self._slots[0])  # fills its caches, so that no first frame is late
         self._armed, self._wanted, self._free = False, 0, list(range(link.SLOTS))
         return link.OpenReply(self._description(), "")
 

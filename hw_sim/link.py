@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 
 from capture.camera.base import CameraDescription
 
-SLOTS = 8
+SLOTS = 12
 WANT, ARM, DISARM, FREE, FRAME = b"Q", b"A", b"D", b"F", b"G"
 _FRAME = struct.Struct("<cIQQIf")
 _FREE = struct.Struct("<cI")

@@ -38,6 +38,7 @@ class Rig:
         Raises:
             SimulationError: the socket or the port cannot be put where asked.
         """
+        self._listener = _listen(socket_path)
         self.pulses: list[Pulse] = []
         self.error: BaseException | None = None
         self._clock = clock
@@ -51,7 +52,6 @@ class Rig:
         self._due: list[tuple[int, int, CameraDevice, link.FrameMessage]] = []
         self._order = itertools.count()
         self._stop = threading.Event()
-        self._listener = self._listen(socket_path)
         self._wake_in, self._wake_out = os.pipe()
         os.set_blocking(self._wake_out, False)
         self._selector = selectors.DefaultSelector()
@@ -89,22 +89,6 @@ class Rig:
     def counts(self) -> dict[str, dict[str, int]]:
         """For each camera, how many edges it exposed, delivered, and dropped because nobody wanted the frame."""
         return {key: dict(vars(device.counts)) for key, device in self._devices.items()}
-
-    def _listen(self, path: Path) -> socket.socket:
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if path.is_socket():
-                path.unlink()
-            listener.bind(str(path))
-        except OSError as error:
-            listener.close()
-            raise SimulationError(
-                f"{path}: the rig's socket cannot be put there ({error}): give a short path (under 100 characters) "
-                "in a folder that can be written"
-            ) from error
-        listener.listen()
-        return listener
 
     def _noise_frames(self, exposure_us: int, gain_db: float) -> list[Pixels]:
         key = (exposure_us, gain_db)
@@ -199,3 +183,23 @@ class Rig:
             pass
         self._selector.unregister(connection)
         device.disconnect()
+
+
+def _listen(path: Path) -> socket.socket:
+    with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)) as probe:
+        if path.is_socket() and probe.connect_ex(str(path)) == 0:
+            raise SimulationError(f"{path}: another simulated rig is running there: stop it or give another path")
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_socket():
+            path.unlink()
+        listener.bind(str(path))
+    except OSError as error:
+        listener.close()
+        raise SimulationError(
+            f"{path}: the rig's socket cannot be put there ({error}): give a short path (under 100 characters) "
+            "in a folder that can be written"
+        ) from error
+    listener.listen()
+    return listener

@@ -15,9 +15,11 @@ import serial
 
 from capture.camera import make_camera
 from capture.camera.base import Camera, CameraSettings, FrameStatus, Grab
-from capture.errors import CameraError, CameraLost
+from capture.clock import SystemClock
+from capture.errors import CameraError, CameraLost, SimulationError
 from capture.trigger_protocol import Pulse, decode_line, encode_line, parse_pulse
 from hw_sim.render import noise_frames
+from hw_sim.rig import Rig
 from hw_sim.spots import led_spots
 from hw_sim.wing_motion import LedMotion
 from hw_sim.world import World
@@ -194,6 +196,14 @@ def test_the_truth_is_written_at_the_end(rig: RunningRig) -> None:
     times = pq.read_table(truth / "markers.parquet")["timestamp_ns"].to_numpy()
     assert times.min() == pulses[0].actual_ns - 200_000_000
     assert 0 <= times.max() - pulses[-1].actual_ns - 200_000_000 < 5_000_000
+
+
+def test_a_second_rig_does_not_take_the_place_of_a_running_one(rig: RunningRig) -> None:
+    with pytest.raises(SimulationError, match="another simulated rig is running"):
+        Rig(rig.world, rig.folder / "rig.sock", rig.folder / "trigger2", SystemClock())
+    camera = rig.camera("left_cam0")
+    camera.open()
+    camera.close()
 
 
 def test_noise_frames_are_drawn_per_exposure_and_gain() -> None:
