@@ -97,20 +97,20 @@ PLATES = (
 COMPARED_PLATES = (
     Plate(
         "error-in-time",
-        "Against the reference",
+        "Error against the reference",
         "Errors set by set, the reference interpolated to each set's instant and station.",
         figures.error_in_time,
     ),
     Plate(
         "error-along-span",
-        "Against the reference",
+        "Error against the reference",
         "RMS error along the span, and what the fit stated (dashed). Where solid lies above dashed, something other "
         "than image noise is at work: calibration, survey, stiffness.",
         figures.error_along_span,
     ),
     Plate(
         "error-by-marker",
-        "Against the reference",
+        "Error against the reference",
         "RMS distance of the measured markers from the reference's, each at its own instant.",
         figures.error_by_marker,
     ),
@@ -133,7 +133,7 @@ def write_report(result: Result, folder: Path) -> Path:
         (folder / FIGURES / f"{plate.name}.png").write_bytes(png)
         sections.setdefault(plate.section, []).append(_figure(plate, png))
     if result.comparison is not None:
-        sections["Against the reference"].append(_marker_table(result.comparison))
+        sections["Error against the reference"].append(_marker_table(result.comparison))
     sections["What was measured"].append(_ledger(result))
     body = [_head(result)]
     body += [f"<section><h2>{_text(title)}</h2>{''.join(parts)}</section>" for title, parts in sections.items()]
@@ -213,7 +213,7 @@ def _compared_head(comparison: Any) -> str:
     compared = comparison["frames_compared"]
     outside = comparison["frames_outside_reference"]
     text = f"Compared with {comparison['reference']}: {compared} sets; {outside} outside of the reference's time."
-    return f"<h2>Error against the reference</h2><p class='sub'>{_text(text)}</p>{_cards(cards)}"
+    return f"<p class='sub'>{_text(text)}</p>{_cards(cards)}"
 
 
 def _marker_table(comparison: Any) -> str:
@@ -286,9 +286,9 @@ def _number(value: float | None, unit: str, *, sign: bool = False) -> str:
     """Three figures and the unit; a dash for what is not known."""
     if value is None:
         return "–"
-    decimals = 1 if abs(value) >= 100 or unit == "%" else 2 if abs(value) >= 0.1 else 3
+    decimals = 1 if abs(value) >= 100 or unit == "%" else 2 if abs(value) >= 0.1 or sign else 3
     space = "" if unit in ("", "°") else " "
-    return f"{value:{'+' if sign else ''}.{decimals}f}{space}{unit}"
+    return f"{round(value, decimals) + 0.0:{'+' if sign else ''}.{decimals}f}{space}{unit}"
 
 
 def _and(words: Sequence[str]) -> str:
