@@ -316,7 +316,7 @@ def _stop(lanes: Sequence[Lane]) -> None:
             grabber.stop(deadline_s=10 * GRAB_TIMEOUT_S)
     for lane in lanes:
         lane.recorder.stop(deadline_s=60.0)
-        lane.recorder.close({})
+        lane.recorder.close((), {})
         for worker in (lane.recorder, *lane.grabbers.values()):
             if worker.error is not None:
                 raise worker.error

@@ -40,7 +40,7 @@ def ceiling_line(ceiling: dict[str, Any]) -> str:
     """The ceiling in one line."""
     return (
         f"ceiling without loss: {ceiling['mb_s']:.0f} MB/s; raw O_DIRECT on the same disk: "
-        f"{ceiling['raw_direct_mb_s']:.0f} MB/s; ratio {ceiling['ratio']:.3f} (medians of {len(ceiling['pairs'])} pairs)"
+        f"{ceiling['raw_direct_mb_s']:.0f} MB/s; ratio {ceiling['ratio']:.3f} (medians, {len(ceiling['pairs'])} pairs)"
     )
 
 

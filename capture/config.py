@@ -100,8 +100,9 @@ class Config(_Table):
         return math.ceil(self.ring.stall_s * self.trigger.rate_hz) + DRIVER_BUFFERS
 
 
-DRIVER_BUFFERS = 6
-"""Buffers a driver holds at all times, so that a full ring is met by us, with a cause, and not by the driver."""
+DRIVER_BUFFERS = 10
+"""Buffers a driver is given, so that a full ring is met by us, with a cause, and not by the driver. At the start some
+of them are held back until the first frames are numbered (capture.numbering.CONFIRMING)."""
 
 
 @dataclass(frozen=True)

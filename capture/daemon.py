@@ -289,7 +289,7 @@ class Recording:
                 self._failures.append(f"{side}: the disk did not take its last frames in {FLUSH_DEADLINE_S:g} s")
             if recorder.error is not None:
                 self._failures.append(f"{recorder.name}: {recorder.error}")
-        self._write_last_losses()
+        self._ledger.settle("the write thread ended before it came to this frame")
         end = {
             "first_index": str(first_index),
             "next_index": str(next_index),
@@ -298,24 +298,18 @@ class Recording:
             "board_confirmed": str(count is not None).lower(),
             "triggers_reported": str(self._aux.triggers),
         }
+        last = self._aux.take()  # booked while the write threads ended
         for recorder in self._recorders.values():
-            recorder.close(end)
+            if recorder.running:  # hung in a write: its files stay as they are, for `wingcap recover`
+                continue
+            recorder.close(last, end)
             if recorder.failure is not None:
                 self._failures.append(str(recorder.failure))
-            else:
+            with contextlib.suppress(OSError):  # the failing disk; its files are readable without
                 self._disk.write_text(
                     recorder.folder / "metadata.yaml", metadata_yaml([*recorder.segments, recorder.aux])
                 )
         return self._result(next_index - first_index, seconds)
-
-    def _write_last_losses(self) -> None:
-        """Losses that were booked while the write threads ended; no thread writes the aux files any more."""
-        messages = self._aux.take()
-        for recorder in self._recorders.values():
-            try:
-                recorder.aux.write_batch(messages)
-            except DiskError as error:
-                recorder.failure = recorder.failure or error
 
     def _result(self, triggers: int, seconds: float) -> RecordingResult:
         return RecordingResult(

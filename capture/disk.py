@@ -27,6 +27,9 @@ class DiskFile(Protocol):
     def write(self, data: memoryview) -> int:
         """Append; how many bytes were taken (fewer: a short write)."""
 
+    def cut(self, size: int) -> None:
+        """Forget everything from ``size`` on; writing goes on there."""
+
     def end_direct(self) -> None:
         """From here on writes need not be whole pages."""
 
@@ -115,6 +118,12 @@ class PlainFile:
         done = os.write(self.descriptor, data)
         self._size += done
         return done
+
+    def cut(self, size: int) -> None:
+        """ftruncate(2) and seek."""
+        os.ftruncate(self.descriptor, size)
+        os.lseek(self.descriptor, size, os.SEEK_SET)
+        self._size = size
 
     def end_direct(self) -> None:
         """Nothing to end."""

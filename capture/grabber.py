@@ -92,17 +92,29 @@ class Grabber(Worker):
         """
         try:
             while not self.stop_requested.is_set():
-                grab = self._camera.grab(GRAB_TIMEOUT_S)
-                if grab is not None:
-                    self._take(grab)
+                self.step(GRAB_TIMEOUT_S)
         except CameraLost as error:
             raise CameraLost(f"{'/'.join(self.place)}: {error}") from error
         finally:
+            self.finish()
             self._camera.disarm()
 
-    def _take(self, grab: Grab) -> None:
+    def step(self, timeout_s: float) -> bool:
+        """Take one frame on its way, when there is one within ``timeout_s``."""
+        grab = self._camera.grab(timeout_s)
+        if grab is None:
+            return False
         self.counts.grabbed += 1
-        numbered = self._numbering.number(grab)
+        for told, numbered in self._numbering.feed(grab):
+            self._take(told, numbered)
+        return True
+
+    def finish(self) -> None:
+        """No more frames will come: take those that waited to be numbered."""
+        for grab, numbered in self._numbering.flush():
+            self._take(grab, numbered)
+
+    def _take(self, grab: Grab, numbered: Numbered | None) -> None:
         if numbered is None or not self._ledger.arrived(self.place, numbered.index, numbered.lost_in_delivery):
             self.counts.duplicates += 1
             self._queue(grab.slot)

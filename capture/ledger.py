@@ -109,6 +109,15 @@ class Ledger:
             for index in missing:
                 self._book(place, index, LossStage.CAMERA, cause)
 
+    def settle(self, cause: str) -> None:
+        """What arrived and is neither recorded nor lost by now never will be. After the write threads have ended."""
+        for place, account in self._accounts.items():
+            with self._mutex:
+                left = sorted(account.pending)
+                account.pending.clear()
+            for index in left:
+                self._book(place, index, LossStage.WRITER, cause)
+
     def complete(self, place: Place, next_index: int) -> bool:
         """Whether every trigger below ``next_index`` has been decided upon for this camera."""
         return self._accounts[place].next_index >= next_index

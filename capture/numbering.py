@@ -21,6 +21,10 @@ class Triggers(Protocol):
         """Index and time of the last trigger at or before ``time_ns``."""
 
 
+CONFIRMING = 4
+"""Frames that must agree before the first one is believed to know its trigger."""
+
+
 @dataclass(frozen=True)
 class Numbered:
     """A frame with its trigger."""
@@ -33,43 +37,61 @@ class Numbered:
 class FrameNumbering:
     """Ties one camera's frames to triggers by counter and time together.
 
-    The first frame belongs to the last trigger before its exposure can have begun, by host time. From then on the
-    *device's* clock says how many periods have passed since the last frame (host time is late when the host is busy,
-    the device's is not), and its frame counter says how many of the skipped triggers were exposed.
+    The first frames are held back until there are ``CONFIRMING`` of them. By host time each belongs to the last trigger
+    before its exposure can have begun, or, when it was delivered late, to an earlier one; so the earliest of what
+    they say about the first frame is believed. From then on the *device's* clock says how many periods have passed
+    since the last frame (host time is late when the host is busy, the device's is not), and its frame counter says
+    how many of the skipped triggers were exposed.
     """
 
     def __init__(self, camera: CameraDescription, triggers: Triggers) -> None:
         self._camera = camera
         self._triggers = triggers
+        self._held: list[Grab] = []
         self._last: tuple[Grab, Numbered] | None = None
-        self.duplicates = 0
-        self.unsolicited = 0
 
-    def number(self, grab: Grab) -> Numbered | None:
-        """The frame's trigger; None for a frame that no trigger asked for or that came before (both counted)."""
-        if self._last is None:
-            found = self._by_host_time(grab)
-            lost_in_delivery = 0
-        else:
-            last_grab, last = self._last
-            steps = (grab.frame_id - last_grab.frame_id) % (1 << self._camera.frame_id_bits)
-            if steps == 0:
-                self.duplicates += 1
-                return None
-            passed_ns = round((grab.device_ticks - last_grab.device_ticks) * 1e9 / self._camera.tick_hz)
-            found = self._triggers.nearest(last.trigger_ns + passed_ns, REPORT_WAIT_S)
-            if found is not None and found[0] <= last.index:
-                self.unsolicited += 1
-                return None
-            lost_in_delivery = min(steps, found[0] - last.index) - 1 if found else 0
-        if found is None:
-            self.unsolicited += 1
+    def feed(self, grab: Grab) -> list[tuple[Grab, Numbered | None]]:
+        """Take a frame; the frames that can be told now, in order.
+
+        A frame is None when it is none of a trigger's: a duplicate, or one that no trigger asked for.
+        """
+        if self._last is not None:
+            return [(grab, self._next(grab, self._last))]
+        self._held.append(grab)
+        return self.flush() if len(self._held) >= CONFIRMING else []
+
+    def flush(self) -> list[tuple[Grab, Numbered | None]]:
+        """Number what is held back, because there is enough of it or because no more will come."""
+        held, self._held = self._held, []
+        first = self._first(held)
+        if first is None:
+            return [(grab, None) for grab in held]
+        self._last = (held[0], first)
+        return [(held[0], first), *(told for grab in held[1:] for told in self.feed(grab))]
+
+    def _first(self, held: list[Grab]) -> Numbered | None:
+        """The trigger of the first of ``held``; None when the board has given none."""
+        readout_ns = self._camera.row_time_ns * self._camera.height
+        found: list[tuple[int, int]] = []
+        for grab in held:
+            later_ns = self._device_ns(grab.device_ticks - held[0].device_ticks)
+            latest_ns = grab.receive_ns - grab.exposure_us * 1000 - readout_ns
+            trigger = self._triggers.latest_before(latest_ns, FIRST_REPORT_WAIT_S)
+            first = trigger and self._triggers.nearest(trigger[1] - later_ns, FIRST_REPORT_WAIT_S)
+            if first:
+                found.append(first)
+        return Numbered(*min(found), 0) if found else None
+
+    def _next(self, grab: Grab, last: tuple[Grab, Numbered]) -> Numbered | None:
+        last_grab, before = last
+        steps = (grab.frame_id - last_grab.frame_id) % (1 << self._camera.frame_id_bits)
+        passed_ns = self._device_ns(grab.device_ticks - last_grab.device_ticks)
+        found = self._triggers.nearest(before.trigger_ns + passed_ns, REPORT_WAIT_S)
+        if steps == 0 or found is None or found[0] <= before.index:
             return None
-        numbered = Numbered(found[0], found[1], lost_in_delivery)
+        numbered = Numbered(found[0], found[1], min(steps, found[0] - before.index) - 1)
         self._last = (grab, numbered)
         return numbered
 
-    def _by_host_time(self, grab: Grab) -> tuple[int, int] | None:
-        readout_ns = self._camera.row_time_ns * self._camera.height
-        latest_ns = grab.receive_ns - grab.exposure_us * 1000 - readout_ns
-        return self._triggers.latest_before(latest_ns, FIRST_REPORT_WAIT_S)
+    def _device_ns(self, ticks: int) -> int:
+        return round(ticks * 1e9 / self._camera.tick_hz)

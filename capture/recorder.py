@@ -137,27 +137,38 @@ class Recorder(Worker):
 
     def work(self) -> None:
         """Write until asked to stop and nothing is left."""
-        while True:
-            try:
-                item = self._queue.get(timeout=0.1)
-            except queue.Empty:
-                if self.stop_requested.is_set():
-                    return
-                continue
-            if isinstance(item, FrameItem):
-                self._take_frame(item)
-            else:
-                self._take_aux(item)
+        while self.step(wait_s=0.1) or not self.stop_requested.is_set():
+            pass
 
-    def close(self, end: dict[str, str]) -> None:
-        """Close both files, ``end`` as aux's last record. After ``stop``; a failing disk is kept in ``failure``."""
+    def step(self, wait_s: float) -> bool:
+        """Write one item, when there is one within ``wait_s``."""
+        try:
+            item = self._queue.get(timeout=wait_s) if wait_s else self._queue.get_nowait()
+        except queue.Empty:
+            return False
+        if isinstance(item, FrameItem):
+            self._take_frame(item)
+        else:
+            self._take_aux(item)
+        return True
+
+    def close(self, messages: Sequence[SmallMessage], end: dict[str, str]) -> None:
+        """Write the last small messages and ``end``, and close both files. After the write thread has ended.
+
+        A disk that fails here is kept in ``failure``.
+        """
         try:
             if self._current is not None:
                 self._current.close()
+        except DiskError as error:
+            self._fail(error)
+        try:
+            self.aux.write_batch(messages)
             self.aux.write_metadata("wingshape_end", end)
             self.aux.close()
         except DiskError as error:
             self._fail(error)
+            self.aux.close_cut()
 
     def _take_frame(self, item: FrameItem) -> None:
         if self.failure is None:
@@ -253,5 +264,5 @@ class Recorder(Worker):
         if self.failure is None:
             self.failure = error
         if self._current is not None:
-            self._current.abandon()
+            self._current.close_cut()
             self._current = None

@@ -9,7 +9,7 @@ from typing import Any
 from capture.disk import SystemDisk
 from capture.errors import RecordingError
 from capture.flight import metadata_yaml
-from capture.record import LOSS_TOPIC, TRIGGER_TOPIC, Loss, LossStage
+from capture.record import LOSS_TOPIC, Loss, LossStage
 from capture.recorder import AUX_CHANNELS
 from capture.scan import ScannedMessage, scan
 from capture.segment import Channel, SegmentWriter, SmallMessage
@@ -76,12 +76,11 @@ def recover_flight(paths: Sequence[Path], out: Path) -> Recovery:
 
 
 def _missing(report: FlightReport) -> list[Loss]:
-    given = {file.provenance.get("side") for file in report.files}
     return [
         Loss(index, report.last_trigger_ns, side, camera_name, LossStage.DISK.name.lower(), CAUSE)
         for name, camera in sorted(report.cameras.items())
         for side, camera_name in [name.split("/")]
-        if side in given
+        if side in report.sides
         for index in range(report.first_index, report.next_index)
         if index not in camera.indices and index not in camera.lost_indices
     ]
@@ -108,7 +107,8 @@ def _copy_segment(disk: SystemDisk, path: Path, copy: Path) -> SegmentWriter | N
 
 def _copy_aux(disk: SystemDisk, folder: Path, copy: Path, report: FlightReport, losses: list[Loss]) -> SegmentWriter:
     """A closed aux file with what can be read of the original's, the new losses, and a final count."""
-    provenance, batches = dict(report.provenance), []
+    side = next(iter({path.name.split("_")[0] for path in folder.glob("*.mcap")} & report.sides), "")
+    provenance, batches = {**report.provenance, "side": side}, []
     numbers = {channel.topic: channel.id for channel in AUX_CHANNELS}
     for path in sorted(folder.glob("aux_*.mcap")):
         try:
@@ -124,7 +124,6 @@ def _copy_aux(disk: SystemDisk, folder: Path, copy: Path, report: FlightReport, 
     writer.write_batch(
         [SmallMessage(numbers[LOSS_TOPIC], x.trigger_index, x.time_ns, x.time_ns, x.encode()) for x in losses]
     )
-    reported = {message.sequence for batch in batches for message in batch if message.channel == numbers[TRIGGER_TOPIC]}
     writer.write_metadata(
         "wingshape_end",
         {
@@ -133,7 +132,7 @@ def _copy_aux(disk: SystemDisk, folder: Path, copy: Path, report: FlightReport, 
             "counter_begin": "0",
             "counter_end": str(report.next_index - report.first_index),
             "board_confirmed": "false",
-            "triggers_reported": str(len(reported)),
+            "triggers_reported": str(report.triggers_reported),
         },
     )
     writer.close()

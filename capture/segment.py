@@ -281,6 +281,15 @@ class SegmentWriter:
         finally:
             self.abandon()
 
+    def close_cut(self) -> None:
+        """Close after a failed write: cut off what was written in part. What the disk refuses now is left as it is,
+        readable up to its last complete chunk."""
+        with contextlib.suppress(OSError):
+            if self._file is not None:
+                self._file.cut(self.bytes_written)
+                self.close()
+        self.abandon()
+
     def abandon(self) -> None:
         """Let go of the file as it is: readable up to its last complete chunk."""
         if self._file is not None:
@@ -324,12 +333,10 @@ class SegmentWriter:
             self._write(memoryview(block))
             return
         length = _round_up(len(block) + _RECORD.size, PAGE)
-        with mmap.mmap(-1, length) as page_aligned:
-            page_aligned[: len(block)] = block
-            view = memoryview(page_aligned)
+        with mmap.mmap(-1, length) as page_aligned, memoryview(page_aligned) as view:
+            view[: len(block)] = block
             _pad(view, len(block), length)
             self._write(view)
-            view.release()
 
     def _write(self, view: memoryview) -> None:
         file = self._open_file()

@@ -1,8 +1,8 @@
 """The trigger board's driver: a serial port to pulses with index and time."""
 
+import bisect
 import queue
 import threading
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -23,47 +23,55 @@ class TriggerLog:
 
     def __init__(self, rate_hz: float) -> None:
         self.period_ns = round(1e9 / rate_hz)
-        self._pulses: OrderedDict[int, int] = OrderedDict()
+        self._indices: list[int] = []
+        self._times_ns: list[int] = []
         self._changed = threading.Condition()
 
     def add(self, pulse: Pulse) -> None:
-        """Book a pulse."""
+        """Book a pulse. One that is not later than the last in index and time (a garbled report) is not believed."""
         with self._changed:
-            self._pulses[pulse.index] = pulse.actual_ns
-            while len(self._pulses) > _PULSES_KEPT:
-                self._pulses.popitem(last=False)
+            if self._indices and (pulse.index <= self._indices[-1] or pulse.actual_ns <= self._times_ns[-1]):
+                return
+            self._indices.append(pulse.index)
+            self._times_ns.append(pulse.actual_ns)
+            if len(self._indices) > 2 * _PULSES_KEPT:
+                del self._indices[:_PULSES_KEPT], self._times_ns[:_PULSES_KEPT]
             self._changed.notify_all()
 
     def nearest(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
         """Index and time of the trigger nearest to ``time_ns``.
 
-        Waits up to ``wait_s`` for the board's report of it; after that its time is extrapolated with the period. None
-        when the board never reported a pulse.
+        Waits up to ``wait_s`` for the board's report of it. A trigger that was not reported is reckoned from its
+        neighbour and the period. None when the board has not reported any pulse.
         """
         with self._changed:
-            found = self._guess(time_ns)
-            if found is None or found[0] not in self._pulses:
-                self._changed.wait_for(lambda: (g := self._guess(time_ns)) is not None and g[0] in self._pulses, wait_s)
-                found = self._guess(time_ns)
-            return found
+            self._changed.wait_for(lambda: self._reported_until(time_ns), wait_s)
+            if not self._indices:
+                return None
+            after = bisect.bisect_left(self._times_ns, time_ns)
+            beside = [k for k in (after - 1, after) if 0 <= k < len(self._indices)]
+            k = min(beside, key=lambda k: abs(self._times_ns[k] - time_ns))
+            steps = round((time_ns - self._times_ns[k]) / self.period_ns)
+            if len(beside) == 2:  # between two reports: no further than the other one
+                other = beside[1 - beside.index(k)]
+                between = abs(self._indices[other] - self._indices[k]) - 1
+                steps = max(-between, min(between, steps))
+            return self._indices[k] + steps, self._times_ns[k] + steps * self.period_ns
 
     def latest_before(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
-        """Index and time of the last trigger at or before ``time_ns``; None when there was none."""
+        """Index and time of the last trigger at or before ``time_ns``; None when none is known."""
         found = self.nearest(time_ns, wait_s)
         if found is None or found[1] <= time_ns:
             return found
-        index = found[0] - 1
         with self._changed:
-            known = self._pulses.get(index)
-            return None if index < next(iter(self._pulses)) else (index, known or found[1] - self.period_ns)
+            before = bisect.bisect_right(self._times_ns, time_ns) - 1
+            if before < 0:
+                return None
+            steps = found[0] - 1 - self._indices[before]
+            return found[0] - 1, self._times_ns[before] + steps * self.period_ns
 
-    def _guess(self, time_ns: int) -> tuple[int, int] | None:
-        if not self._pulses:
-            return None
-        index, at = next(reversed(self._pulses.items()))
-        steps = round((time_ns - at) / self.period_ns)
-        index, at = index + steps, at + steps * self.period_ns
-        return index, self._pulses.get(index, at)
+    def _reported_until(self, time_ns: int) -> bool:
+        return bool(self._times_ns) and self._times_ns[-1] > time_ns - self.period_ns // 2
 
 
 @dataclass(frozen=True)

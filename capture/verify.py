@@ -8,7 +8,7 @@ from typing import Any
 
 from capture.errors import RecordingError
 from capture.flight import find_folders
-from capture.record import LOSS_TOPIC, TRIGGER_TOPIC, Frame, Loss, Trigger, decode_image
+from capture.record import LOSS_TOPIC, SIDES, TRIGGER_TOPIC, Frame, Loss, Trigger, decode_image
 from capture.scan import Scan, ScannedMessage, scan
 
 _PROBLEMS_KEPT = 100
@@ -34,6 +34,7 @@ class FlightReport:
     files: list[Scan] = field(default_factory=list)
     cameras: dict[str, CameraReport] = field(default_factory=dict)
     triggers: int = 0
+    triggers_reported: int = 0  # by the board, one by one
     first_trigger_ns: int = 0
     last_trigger_ns: int = 0
     first_index: int = 0
@@ -46,6 +47,12 @@ class FlightReport:
     def whole(self) -> bool:
         """Whether nothing is wrong."""
         return not self.problems
+
+    @property
+    def sides(self) -> set[str]:
+        """The sides whose disk's folder was given, readable or not."""
+        named = {path.name.split("_")[0] for folder in self.folders for path in folder.glob("*.mcap")}
+        return (named | {file.provenance.get("side", "") for file in self.files}) & set(SIDES)
 
     @property
     def recorded(self) -> int:
@@ -162,15 +169,15 @@ def _check_one_flight(report: FlightReport) -> None:
     if len(flights) > 1:
         report.problems.append(f"the folders hold {len(flights)} different flights: give those of one flight")
     expected = set(report.provenance.get("cameras", "").split())
-    given = {file.provenance.get("side", "") for file in report.files}
     for name in sorted(expected):
-        if name.split("/")[0] not in given:
+        if name.split("/")[0] not in report.sides:
             report.problems.append(f"{name}: the folder of its disk was not given: name it too")
         else:
             report.cameras.setdefault(name, CameraReport())
 
 
 def _check_books(report: FlightReport, pulses: dict[int, Trigger], ends: list[dict[str, str]]) -> None:
+    report.triggers_reported = len(pulses)
     if pulses:
         report.first_trigger_ns = pulses[min(pulses)].reported_time_ns
         report.last_trigger_ns = pulses[max(pulses)].reported_time_ns

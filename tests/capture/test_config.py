@@ -2,14 +2,14 @@
 
 import pytest
 
-from capture.config import load_config
+from capture.config import DRIVER_BUFFERS, load_config
 from capture.errors import ConfigError
 
 
 def test_defaults_and_relative_paths(write_config, tmp_path):
     config = load_config(write_config(rate_hz=25)).config
     assert config.disks.left == tmp_path / "ssd_left"
-    assert config.ring_slots == 13 + 6  # 0.5 s of stall at 25 Hz, and what the driver holds
+    assert config.ring_slots == 13 + DRIVER_BUFFERS  # 0.5 s of stall at 25 Hz, and what the driver holds
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,74 @@
+"""Frames to triggers, against a board and a camera whose truth is known."""
+
+import random
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from capture.camera.base import CameraDescription, FrameStatus, Grab
+from capture.numbering import CONFIRMING, FrameNumbering
+from capture.trigger import TriggerLog
+from capture.trigger_protocol import Pulse
+
+PERIOD_NS, EXPOSURE_US, ROW_NS, HEIGHT = 40_000_000, 2000, 10_000, 1552
+CAMERA = CameraDescription("x", "1", 2080, HEIGHT, EXPOSURE_US, 0.0, ROW_NS, 1e9, 16, True)
+START_NS = 1_800_000_000_000_000_000
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    missed=st.sets(st.integers(0, 59), max_size=20),
+    undelivered=st.sets(st.integers(0, 59), max_size=10),
+    unreported=st.sets(st.integers(1, 59), max_size=10),
+    drift_ppm=st.floats(-100, 100),
+)
+def test_every_frame_gets_its_own_trigger(seed, missed, undelivered, unreported, drift_ppm):
+    """Trigger jitter, latency with tails (one of the first frames is prompt), gaps of all kinds, a wrapping counter."""
+    draw = random.Random(seed)
+    edges = [START_NS + k * PERIOD_NS + draw.randint(-100_000, 100_000) for k in range(60)]
+    log = TriggerLog(1e9 / PERIOD_NS)
+    for index, edge_ns in enumerate(edges):
+        if index not in unreported:
+            log.add(Pulse(index, index, edge_ns, edge_ns))
+    # The report of the very last triggers may be missing for good; what comes before must not wait for it.
+    frame_id, frames, truth = 65520, [], []
+    for index, edge_ns in enumerate(edges):
+        if index in missed:
+            continue
+        frame_id = (frame_id + 1) % 65536
+        if index in undelivered:
+            continue
+        late_ns = 500_000 if len(frames) % CONFIRMING == 2 else draw.randint(0, 100_000_000)
+        ticks = round((edge_ns - START_NS) * (1 + drift_ppm * 1e-6)) + 77
+        receive_ns = edge_ns + EXPOSURE_US * 1000 + ROW_NS * HEIGHT + late_ns
+        frames.append(Grab(0, frame_id, ticks, receive_ns, EXPOSURE_US, 0.0, FrameStatus.COMPLETE))
+        truth.append(index)
+    numbering = FrameNumbering(CAMERA, log)
+    told = [pair for grab in frames for pair in numbering.feed(grab)] + numbering.flush()
+    assert [grab for grab, _ in told] == frames
+    if len(frames) >= CONFIRMING:
+        assert [numbered.index for _, numbered in told] == truth
+
+
+def test_a_repeated_frame_and_one_without_a_trigger_are_nobodys():
+    log = TriggerLog(25)
+    numbering = FrameNumbering(CAMERA, log)
+    stray = Grab(0, 1, 0, START_NS, EXPOSURE_US, 0.0, FrameStatus.COMPLETE)
+    assert numbering.feed(stray) == []
+    assert numbering.flush() == [(stray, None)]
+    for index in range(10):
+        log.add(Pulse(index, index, START_NS + index * PERIOD_NS, START_NS + index * PERIOD_NS))
+    frames = [
+        Grab(0, 5 + k, k * PERIOD_NS, START_NS + k * PERIOD_NS + 20_000_000, EXPOSURE_US, 0.0, FrameStatus.COMPLETE)
+        for k in range(5)
+    ]
+    told = [pair for grab in [*frames, frames[-1]] for pair in numbering.feed(grab)]
+    assert [numbered and numbered.index for _, numbered in told] == [0, 1, 2, 3, 4, None]
+
+
+def test_the_log_believes_no_pulse_that_goes_back():
+    log = TriggerLog(25)
+    for index, time_ns in ((5, 1_000_000_000), (5, 1_000_000_001), (4, 2_000_000_000), (6, 999_999_999)):
+        log.add(Pulse(index, 1, time_ns, time_ns))
+    assert log.nearest(1_000_000_300, 0.0) == (5, 1_000_000_000)
+    assert log.nearest(1_000_000_000 + 3 * PERIOD_NS, 0.0) == (8, 1_000_000_000 + 3 * PERIOD_NS)
