@@ -6,11 +6,21 @@ A failing seed replays with ``Simulation(Plan.of(seed)).run(folder)``.
 import dataclasses
 import os
 import tempfile
+import types
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+import pytest
 from fault_simulation import Outcome, Plan, Simulation
+
+from capture.camera.base import FrameStatus
+from capture.grabber import Grabber
+from capture.ledger import Ledger
+from capture.numbering import FrameNumbering
+from capture.recorder import Recorder
+from capture.segment import FrameLayout, SegmentWriter
 
 MEMORY = Path("/dev/shm") if os.access("/dev/shm", os.W_OK) else None
 
@@ -70,7 +80,7 @@ def off_by_one_index(patch):
 
 
 def missed_crc(patch):
-    patch.setattr("capture.segment.zlib.crc32", lambda data, start=0: 12345)
+    patch.setattr("capture.segment.zlib", types.SimpleNamespace(crc32=lambda data: 12345))
 
 
 def slot_given_back_early(patch):
@@ -167,7 +177,8 @@ def violates(seed: int) -> bool:
 def test_two_thousand_flights(capsys):
     outcomes = fly_many(range(2000))
     check(outcomes)
-    faults, lost = Counter(), Counter()
+    faults: Counter[str] = Counter()
+    lost: Counter[str] = Counter()
     for outcome in outcomes:
         faults.update(outcome.plan.faults())
         lost.update(outcome.lost)
