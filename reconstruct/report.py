@@ -125,12 +125,15 @@ def write_report(result: Result, folder: Path) -> Path:
     """
     if not any(np.isfinite(side.frames["tip_dz_m"]).any() for side in result.sides.values()):
         raise ReconstructError(f"{result.folder}: no set was fitted, there is nothing to report; see frames.parquet")
-    plates = (*(COMPARED_PLATES if result.comparison is not None else ()), *PLATES)
     (folder / FIGURES).mkdir(parents=True, exist_ok=True)
     sections: dict[str, list[str]] = {}
-    for plate in (plate for plate in plates if plate.applies(result)):
+    for plate in (*COMPARED_PLATES, *PLATES):
+        file = folder / FIGURES / f"{plate.name}.png"
+        file.unlink(missing_ok=True)
+        if not plate.applies(result) or (plate in COMPARED_PLATES and result.comparison is None):
+            continue
         png = _draw(plate, result)
-        (folder / FIGURES / f"{plate.name}.png").write_bytes(png)
+        file.write_bytes(png)
         sections.setdefault(plate.section, []).append(_figure(plate, png))
     if result.comparison is not None:
         sections["Error against the reference"].append(_marker_table(result.comparison))

@@ -17,7 +17,7 @@ from process.pipeline import markers as measure_markers
 from process.tables import write_table
 from reconstruct.compare import Comparison, compare
 from reconstruct.report import write_report
-from reconstruct.result import COMPARISON, MARKER_ERRORS, SHAPE_ERRORS, SUMMARY, read_result
+from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_result
 from reconstruct.result_tables import result_tables
 from reconstruct.series import SideFits, fit_series
 from reconstruct.summary import summarise
@@ -116,9 +116,10 @@ def _measure(job: Job, progress: Progress) -> tuple[pa.Table, str, list[Path], t
 
 def _write_tables(job: Job, table: pa.Table, fits: dict[str, SideFits], inputs: Sequence[Path]) -> None:
     job.out.mkdir(parents=True, exist_ok=True)
-    for stale in (COMPARISON, SHAPE_ERRORS, MARKER_ERRORS):
-        (job.out / stale).unlink(missing_ok=True)
     tables = result_tables(fits)
+    texts = [Path(name).with_suffix(".csv").name for name in (*tables, MARKERS)]
+    for stale in (REPORT, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
+        (job.out / stale).unlink(missing_ok=True)  # a run that fails half way must not leave an older one's words
     for name, content in tables.items():
         write_table(content, job.out / name, command=job.command, inputs=inputs)
     if job.markers is None:

@@ -146,9 +146,12 @@ def test_nothing_fitted_is_an_error_that_says_why(bending_wing: Any, wing_file: 
 def test_a_new_run_removes_the_old_comparison(bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
     pq.write_table(bending_wing().marker_table(np.arange(3) * 0.04), tmp_path / "table.parquet")
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "comparison.json").write_text("{}")
+    for old in ("comparison.json", "shape.csv", "figures/error-in-time.png"):
+        (tmp_path / "out" / old).parent.mkdir(exist_ok=True)
+        (tmp_path / "out" / old).write_text("{}")
     run_job(Job((), None, tmp_path / "table.parquet", wing_file, tmp_path / "out", False, 1, ""), lambda *_: None)
-    assert not (tmp_path / "out" / "comparison.json").exists()
+    for old in ("comparison.json", "shape.csv", "figures/error-in-time.png"):
+        assert not (tmp_path / "out" / old).exists()
 
 
 def test_a_folder_without_a_result(tmp_path: Path) -> None:
