@@ -12,10 +12,13 @@ from reconstruct.loads import Loads, generalised_force, generalised_force_and_ta
 from reconstruct.rotation import Array
 
 _CONVERGED = 1e-10  # change of an element's turn (rad) and stretch in the last Newton step
-_LARGEST_TURN_RAD = 0.5  # of an element in one step
+_LARGEST_TURN_RAD = 1.5  # of any node in one step
+_NEAR_RAD = 0.05  # a step that turns no node more than this may go where the tangent is not positive
 _ITERATIONS = 60
 _HALVINGS = 12
+_LARGEST_SHIFT = 1e4  # of the stiffness
 _SMALLEST_LOAD_STEP = 1 / 4096
+_SMALLEST_STABLE_STEP = 1 / 128  # of the load, taken once more before a beam is believed to have become unstable
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +42,13 @@ def solve(beam: Beam, loads: Loads, start: Array | None = None) -> Equilibrium:
         loads: what acts on it.
         start: (N, 4) strains to begin from; the unstrained beam when None.
 
-    Newton starts with the full load. If that does not converge, or ends where the beam would not stay (several
-    equilibria exist under large loads), the load is raised in steps from the unstrained beam instead, which follows
-    the path a real wing takes.
+    Newton starts with the full load. If that does not converge, or ends where a beam under dead forces would not stay
+    (several equilibria exist under large loads), the load is raised in steps from the unstrained beam instead, which
+    follows the path a real wing takes.
     """
     begin = np.zeros((beam.elements, 4)) if start is None else start
     direct = _newton(beam, loads, begin)
-    if direct.converged and direct.stable:
+    if direct.converged and (direct.stable or not loads.conservative):
         return direct
     stepped = _in_load_steps(beam, loads, direct.iterations)
     return stepped if stepped.converged or not direct.converged else direct
@@ -54,14 +57,17 @@ def solve(beam: Beam, loads: Loads, start: Array | None = None) -> Equilibrium:
 def _in_load_steps(beam: Beam, loads: Loads, iterations: int) -> Equilibrium:
     strain = np.zeros((beam.elements, 4))
     before, before_level = strain, 0.0
-    level, increment, steps = 0.0, 0.25, 0
+    level, increment, steps, stable = 0.0, 0.25, 0, True
     while True:
         target = min(1.0, level + increment)
         rate = (target - level) / (level - before_level) if level > before_level else 0.0
         found = _newton(beam, loads.scaled(target), strain + min(rate, 1.0) * (strain - before))
         iterations += found.iterations
-        if found.converged:
+        # an unstable answer next to a stable one is another branch, unless small steps lead there too
+        jumped = loads.conservative and stable and not found.stable and increment > _SMALLEST_STABLE_STEP
+        if found.converged and not jumped:
             steps += 1
+            stable = found.stable
             before, before_level = strain, level
             strain, level = found.shape.strain, target
             increment *= 1.5 if found.iterations <= 8 else 1.0
@@ -86,14 +92,12 @@ def _newton(beam: Beam, loads: Loads, strain: Array) -> Equilibrium:
     Q, H = generalised_force_and_tangent(beam, shape, loads)
     residual = norm(K @ strain.ravel() - Q)
     for iteration in range(1, _ITERATIONS + 1):
-        try:
-            step = np.linalg.solve(K - H, Q - K @ shape.strain.ravel()).reshape(-1, 4)
-        except np.linalg.LinAlgError:
-            return _failed(beam, iteration, 1, "the tangent is singular")
+        step = _step(K, H, K @ shape.strain.ravel() - Q, length, loads.conservative)
+        if step is None:
+            return _failed(beam, iteration, 1, "the loads are not finite, or the tangent is singular")
         largest = float(np.abs(step * length).max())
-        if not np.isfinite(largest):
-            return _failed(beam, iteration, 1, "the loads are not finite numbers")
-        factor = min(1.0, _LARGEST_TURN_RAD / max(largest, 1e-300))
+        turn = _largest_turn(step, length)
+        factor = min(1.0, _LARGEST_TURN_RAD / max(turn, 1e-300))
         for _ in range(_HALVINGS):
             trial = shape_of(beam, shape.strain + factor * step)
             trial_residual = norm(K @ trial.strain.ravel() - generalised_force(beam, trial, loads))
@@ -107,6 +111,32 @@ def _newton(beam: Beam, loads: Loads, strain: Array) -> Equilibrium:
             relative = residual / max(norm(Q), norm(K @ shape.strain.ravel()), 1e-300)
             return Equilibrium(True, shape, iteration, 1, _positive(K - H), relative if residual > 0 else 0.0, "")
     return _failed(beam, _ITERATIONS, 1, f"Newton's method did not settle in {_ITERATIONS} steps")
+
+
+def _step(K: Array, H: Array, excess: Array, length: Array, conservative: bool) -> Array | None:
+    """Newton's step (N, 4); far from an energy minimum with as much more stiffness as makes the tangent positive."""
+    tangent = K - H
+    if not (np.isfinite(tangent).all() and np.isfinite(excess).all()):
+        return None
+    shift = 0.0
+    while True:
+        try:
+            step = -np.linalg.solve(tangent + shift * K, excess).reshape(-1, 4)
+        except np.linalg.LinAlgError:
+            return None
+        if (
+            not conservative
+            or _largest_turn(step, length) < _NEAR_RAD
+            or shift > _LARGEST_SHIFT
+            or _positive(tangent + shift * K)
+        ):
+            return step
+        shift = max(0.25, 2 * shift)
+
+
+def _largest_turn(step: Array, length: Array) -> float:
+    """By how much the step turns any node, about (rad)."""
+    return float(np.abs(np.cumsum(step[:, 1:] * length, axis=0)).max())
 
 
 def _positive(tangent: Array) -> bool:

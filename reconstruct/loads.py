@@ -39,6 +39,11 @@ class Loads:
         )
 
     @property
+    def conservative(self) -> bool:
+        """Whether all loads are dead forces, so that the tangent is symmetric and rest a minimum of energy."""
+        return not self.follows and not self.moment_nm.any()
+
+    @property
     def follows(self) -> bool:
         """Whether any load turns with its section."""
         return self.follower_force_n is not None or self.follower_moment_nm is not None

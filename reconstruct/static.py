@@ -31,12 +31,13 @@ def static(
     which: Literal["left", "right"] = "left" if side == "left" else "right"
     described = read_loads(loads)
     half = read_wing(wing, described.stations_m).half(which)
-    found = solve(half.beam, loads_on(half, described))
+    acting = loads_on(half, described)
+    found = solve(half.beam, acting)
     if not found.converged:
         raise ReconstructError(
             f"{loads}: no static shape: {found.reason}; check the loads against the wing's stiffness"
         )
-    result = _result(half, found)
+    result = _result(half, found, acting.conservative)
     if plot is not None:
         _draw(half, found, plot)
     if json:
@@ -45,7 +46,7 @@ def static(
         _print(result)
 
 
-def _result(half: HalfWing, found: Equilibrium) -> dict[str, Any]:
+def _result(half: HalfWing, found: Equilibrium, conservative: bool) -> dict[str, Any]:
     position = found.shape.position_m
     moved = position - half.rest_position_m
     twist = np.degrees(twist_rad(half, found.shape.R_body_section))
@@ -61,7 +62,7 @@ def _result(half: HalfWing, found: Equilibrium) -> dict[str, Any]:
     return {
         "side": half.side,
         "converged": found.converged,
-        "stable": found.stable,
+        "stable": found.stable if conservative else None,  # an energy tells for dead forces only
         "iterations": found.iterations,
         "load_steps": found.load_steps,
         "residual": found.residual,
@@ -79,7 +80,9 @@ def _print(result: dict[str, Any]) -> None:
         x, y, z = (1e3 * value for value in node["displacement_m"])
         say(f"{node['s_m']:9.4f} {x:10.3f} {y:10.3f} {z:10.3f} {node['twist_deg']:10.4f}")
     steps = f"{result['iterations']} iterations, {result['load_steps']} load steps"
-    kept = "stable" if result["stable"] else "not a minimum of the energy: the wing may not stay in this shape"
+    kept = "stability is not judged for moments and follower loads"
+    if result["stable"] is not None:
+        kept = "stable" if result["stable"] else "not a minimum of the energy: the wing will not stay in this shape"
     say(f"converged in {steps}, residual {result['residual']:.1e}; {kept}")
 
 
