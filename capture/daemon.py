@@ -161,9 +161,8 @@ class Recording:
             cleanup.callback(board.close)
             board.start()
             name = board.hello()
+            before = board.end()  # it may still be running for a recorder that was killed
             board.set_rate(self._config.trigger.rate_hz)
-            was_running, _ = board.status()
-            before = board.end() if was_running else board.status()[1]
             self._make_lanes(name)
             for lane in self._lanes.values():
                 lane.start()

@@ -66,6 +66,8 @@ def scan(path: Path) -> tuple[Scan, Iterator[ScannedMessage]]:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else None
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
+    if data is not None:
+        data.madvise(mmap.MADV_SEQUENTIAL)
     if data is None or data[: len(MAGIC)] != MAGIC:
         raise RecordingError(f"{path}: not an MCAP file (or its beginning is damaged): restore it from a copy")
     found = Scan(path, size)

@@ -121,11 +121,6 @@ class TriggerBoard(Worker):
         words = self._ask("STOP")
         return self._count(words)
 
-    def status(self) -> tuple[bool, BoardCount]:
-        """Whether the board is running, and its counts."""
-        words = self._ask("STATUS")
-        return words[:1] == ("1",), self._count(words[1:])
-
     def close(self) -> None:
         """Let go of the port. Safe to call twice."""
         self.stop(deadline_s=1.0)

@@ -56,7 +56,9 @@ class WingMotion:
         self._node_shapes = self._shapes(at)
         self._node_dihedral = np.concatenate([np.zeros_like(nodes), np.full_like(nodes, dihedral)])
         self._section_shapes = self._shapes(self.stations_m)
-        self._section_dihedral = np.where(self.stations_m >= wing.break_m, dihedral, 0.0)
+        self._section_dihedral = np.where(
+            self.stations_m > wing.break_m, dihedral, 0.0
+        )  # at the break: the inboard one
 
     def points(self, times_ns: Times) -> Array:
         """The reference axis (..., n, 3) in metres, body frame; ``times_ns`` (..., n) or (..., 1), UTC."""
