@@ -17,6 +17,7 @@ Image = NDArray[np.uint8]
 
 FINDERS = ("edges", "subpix", "sb")  # how a corner's place can be measured; see find_corners
 SEARCH_WIDTH_PX = 1100  # the plain finder looks at the picture at about this width first: it is much faster there
+MIN_SPACING_PX = 5.0
 REFINE_RADIUS_PX = 10.0  # of the window around a corner; beyond it, lens distortion bends the edges
 
 
@@ -132,19 +133,23 @@ def find_corners(path: Path, image: Image, board: Board) -> View:
 
 
 def _find_plain(image: Image, board: Board) -> Array | None:
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    shape = (board.columns, board.rows)
+    # no CALIB_CB_NORMALIZE_IMAGE: it spreads the noise of a dark surround over all grey values, misses boards there
+    # and takes half a minute over it
+    shape, flags = (board.columns, board.rows), cv2.CALIB_CB_ADAPTIVE_THRESH
     factor = SEARCH_WIDTH_PX / max(image.shape)
     if factor < 0.8:
         small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-        found, corners = cv2.findChessboardCorners(small, shape, flags=flags | cv2.CALIB_CB_FAST_CHECK)
+        found, corners = cv2.findChessboardCorners(small, shape, flags=flags)
         if found:
             scale = np.array([image.shape[1] / small.shape[1], image.shape[0] / small.shape[0]])
             corners = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
             reach = max(2, round(1.5 / factor))
             return _subpix(image, corners, min(reach, int(0.4 * corner_spacing_px(corners, board))))
-    found, corners = cv2.findChessboardCorners(image, shape, flags=flags | cv2.CALIB_CB_FAST_CHECK)
-    return np.asarray(corners, np.float64).reshape(-1, 2) if found else None
+    for picture in (image, cv2.GaussianBlur(image, (0, 0), 1.0)):
+        found, corners = cv2.findChessboardCorners(picture, shape, flags=flags)
+        if found:
+            return np.asarray(corners, np.float64).reshape(-1, 2)
+    return None
 
 
 def _find_sector_based(image: Image, board: Board, near: Array | None) -> Array | None:
@@ -155,8 +160,7 @@ def _find_sector_based(image: Image, board: Board, near: Array | None) -> Array 
         left, top = (int(max(0.0, low)) for low in near.min(axis=0) - margin)
         right, bottom = (int(high) for high in near.max(axis=0) + margin)
     part = np.ascontiguousarray(image[top:bottom, left:right])
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-    found, corners = cv2.findChessboardCornersSB(part, (board.columns, board.rows), flags=flags)
+    found, corners = cv2.findChessboardCornersSB(part, (board.columns, board.rows), flags=cv2.CALIB_CB_ACCURACY)
     return np.asarray(corners, np.float64).reshape(-1, 2) + np.array([left, top]) if found else None
 
 
@@ -244,8 +248,8 @@ def _inside_squares(image: Image, corners: Array, board: Board) -> Array:
 def _why_unusable(image: Image, corners: Array, board: Board) -> str:
     """Why these corners are not this board's; empty if they are."""
     spacing = corner_spacing_px(corners, board)
-    if spacing < 8.0:
-        return f"the board is too small in the picture: {spacing:.0f} px between corners, 8 are needed"
+    if spacing < MIN_SPACING_PX:
+        return f"the board is too small in the picture: {spacing:.1f} px between corners, {MIN_SPACING_PX:g} are needed"
     fit, _ = cv2.findHomography(board.points_m, corners)
     if fit is None:
         return "the corners found do not form a plane grid"

@@ -1,0 +1,177 @@
+"""``wingproc calibrate``: two sets of board images to pair.json, and a table of how well the calibration fits."""
+
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from capture.console import note, say, say_json
+from capture.errors import ProcessError, UsageError
+from process.board import Board
+from process.calibrate import CalibrationSettings, Method, calibration_covariance_m2
+from process.calibration_report import write_report
+from process.calibration_session import SessionCalibration, calibrate_session, find_session, image_pairs
+from process.camera_model import write_pair
+from process.json_file import finite_or_none, provenance
+
+RANGES_M = (1.0, 2.0, 3.0)
+
+
+def calibrate(
+    cam0: Annotated[
+        str, typer.Option(help="Images of the left camera: a quoted pattern such as 'A*.png', or a folder.")
+    ],
+    cam1: Annotated[str, typer.Option(help="Images of the right camera, in the same order.")],
+    board: Annotated[str, typer.Option(help="Inner corners of the checkerboard, such as 10x7.")],
+    square_mm: Annotated[float, typer.Option(help="Side of one square.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The pair's file to write (JSON).")],
+    method: Annotated[
+        Method, typer.Option(help="Everything at once, or the paper's way: each camera alone, then the pose between.")
+    ] = Method.joint,
+    nominal_board: Annotated[
+        bool, typer.Option("--nominal-board", help="Trust the print: do not estimate the board's corners.")
+    ] = False,
+    distortion_terms: Annotated[
+        int, typer.Option(help="5 (k1 k2 p1 p2 k3), or 2 (k1 k2) for a board that covers little of the image.")
+    ] = 5,
+    report: Annotated[Path | None, typer.Option(help="Also write a report (HTML).")] = None,
+    workers: Annotated[int, typer.Option(min=1, max=2, help="Processes that look for corners.")] = 2,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Calibrate a camera pair from images of a checkerboard seen by both cameras at the same time."""
+    if distortion_terms not in (2, 5):
+        raise UsageError(f"--distortion-terms {distortion_terms}: 2 or 5")
+    target = Board.parse(board, square_mm)
+    pairs = image_pairs(cam0, cam1)
+    for path in filter(None, (output, report)):
+        if not path.resolve().parent.is_dir():
+            raise ProcessError(f"{path.parent}: no such folder to write to; make it first")
+    with _progress() as progress:
+        session = find_session(pairs, target, workers, progress)
+    settings = CalibrationSettings(method, nominal_board, distortion_terms)
+    result = calibrate_session(session, settings)
+    summary = summarise(result, target)
+    command = shlex.join(["wingproc", *sys.argv[1:]])
+    made = provenance(command, [path for pair in pairs for path in pair])
+    calibration = result.calibration
+    write_pair(
+        output,
+        calibration.pair,
+        camera_rms_px=calibration.camera_rms_px,
+        stereo_rms_px=calibration.stereo_rms_px,
+        provenance=made,
+        calibration=summary["calibration"],
+        board=summary["board"],
+        views=summary["views"],
+    )
+    if report is not None:
+        write_report(report, result, target, summary, command)
+    for warning in calibration.warnings:
+        note(f"warning: {warning}")
+    if json:
+        say_json({**summary, "output": str(output)})
+    else:
+        _print(summary, output, report)
+
+
+def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
+    """What is printed, and written beside the parameters."""
+    calibration = result.calibration
+    pair = calibration.pair
+    view_rms_px = np.sqrt(np.mean(np.sum(calibration.residuals_px**2, axis=-1), axis=2))
+    print_error = calibration.board_m - board.points_m
+    return {
+        "cameras": [
+            {
+                "rms_px": calibration.camera_rms_px[index],
+                "alone_rms_px": calibration.alone_rms_px[index],
+                "K": camera.K.tolist(),
+                "distortion": camera.distortion.tolist(),
+            }
+            for index, camera in enumerate((pair.cam0, pair.cam1))
+        ],
+        "stereo": {"rms_px": calibration.stereo_rms_px, "baseline_m": pair.baseline_m},
+        "calibration": {
+            "method": calibration.settings.method.value,
+            "distortion_terms": calibration.settings.distortion_terms,
+            "alone_rms_px": list(calibration.alone_rms_px),
+            "two_stage_rms_px": calibration.two_stage_rms_px,
+            "library_rms_px": list(calibration.library_rms_px),
+            "sigma_px": calibration.sigma_px,
+            "gradient": calibration.gradient,
+            "finders": list(result.finders),
+            "finder_rms_px": list(result.finder_rms_px),
+            "predicted_sigma_mm": _predicted_sigma_mm(result),
+            "warnings": calibration.warnings,
+        },
+        "board": {
+            "columns": board.columns,
+            "rows": board.rows,
+            "square_m": board.square_m,
+            "estimated": bool(np.any(calibration.board_sigma_m > 0.0)),
+            "print_error_rms_m": float(np.sqrt(np.mean(print_error**2))),
+            "corners_m": calibration.board_m.tolist(),
+        },
+        "views": [
+            {"cam0": str(path0), "cam1": str(path1), "used": True, "rms_px": view_rms_px[:, index].tolist()}
+            for index, (path0, path1) in enumerate(result.used)
+        ]
+        + [
+            {"cam0": str(path0), "cam1": str(path1), "used": False, "reason": reason}
+            for path0, path1, reason in result.rejected
+        ],
+    }
+
+
+def _predicted_sigma_mm(result: SessionCalibration) -> list[dict[str, Any]]:
+    """Sigma of a point in the middle of the pair's view, from the calibration alone."""
+    pair = result.calibration.pair
+    if pair.covariance is None:
+        return []
+    points = np.array([[0.5 * pair.baseline_m, 0.0, z] for z in RANGES_M])
+    sigma_mm = 1000.0 * np.sqrt(np.diagonal(calibration_covariance_m2(pair, points), axis1=1, axis2=2))
+    return [
+        {"range_m": z, "sigma_xyz_mm": [finite_or_none(value) for value in sigma]}
+        for z, sigma in zip(RANGES_M, sigma_mm, strict=True)
+    ]
+
+
+def _print(summary: dict[str, Any], output: Path, report: Path | None) -> None:
+    detail, used = summary["calibration"], sum(view["used"] for view in summary["views"])
+    say(f"views        {used} of {len(summary['views'])} used, corners by {' and '.join(detail['finders'])}")
+    for view in summary["views"]:
+        if not view["used"]:
+            say(f"  left out   {Path(view['cam0']).name}, {Path(view['cam1']).name}: {view['reason']}")
+    say("             RMS px   alone px        fx        fy        cx        cy")
+    for name, camera in zip(("cam0", "cam1"), summary["cameras"], strict=True):
+        K = camera["K"]
+        say(
+            f"{name:<12} {camera['rms_px']:6.4f}   {camera['alone_rms_px']:8.4f}  "
+            f"{K[0][0]:8.2f}  {K[1][1]:8.2f}  {K[0][2]:8.2f}  {K[1][2]:8.2f}"
+        )
+    say(
+        f"stereo       {summary['stereo']['rms_px']:6.4f}   {detail['two_stage_rms_px']:8.4f}  (the paper's two stages)"
+    )
+    say(f"baseline     {1000 * summary['stereo']['baseline_m']:.3f} mm")
+    if summary["board"]["estimated"]:
+        say(f"print        corners off their places by {1e6 * summary['board']['print_error_rms_m']:.0f} um RMS")
+    for entry in detail["predicted_sigma_mm"]:
+        x, y, z = entry["sigma_xyz_mm"]
+        say(f"at {entry['range_m']:g} m       sigma {x:.3f} {y:.3f} {z:.3f} mm (x, y, z of cam0), from the calibration")
+    say(f"optimum      gradient {detail['gradient']:.1e}")
+    say(f"written      {output}" + (f", {report}" if report else ""))
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int], None]]:
+    columns = (TextColumn("corners"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("corners", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

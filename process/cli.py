@@ -1,0 +1,16 @@
+"""The command ``wingproc``: calibration, the rig, and markers from recordings."""
+
+import typer
+
+from capture.console import run
+from process.calibrate_command import calibrate
+from process.markers_command import markers
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="From recorded frames to 3-D markers.")
+app.command()(calibrate)
+app.command()(markers)
+
+
+def main() -> None:
+    """Entry point of ``wingproc``."""
+    run(app)
