@@ -19,7 +19,8 @@ def test_the_four_packages_come_from_this_checkout():
 
 def test_the_recorder_loads_neither_cv2_nor_scipy():
     """The daemon must start in a second and stay small; what looks at pictures runs elsewhere."""
-    code = "import sys, capture.cli, capture.daemon; print([m for m in ('cv2', 'scipy', 'pyarrow') if m in sys.modules])"
+    heavy = ("cv2", "scipy", "pyarrow")
+    code = f"import sys, capture.cli, capture.daemon; print([m for m in {heavy} if m in sys.modules])"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "[]"
 
