@@ -35,7 +35,7 @@ class Equilibrium:
 
 
 def solve(beam: Beam, loads: Loads, start: Array | None = None) -> Equilibrium:
-    """K·q = Q(q) (eq. 15).
+    """K·q = Q(q) (eqs. 7 and 15).
 
     Args:
         beam: the structure.
@@ -121,7 +121,7 @@ def _step(K: Array, H: Array, excess: Array, length: Array, conservative: bool) 
     shift = 0.0
     while True:
         try:
-            step = -np.linalg.solve(tangent + shift * K, excess).reshape(-1, 4)
+            step: Array = -np.linalg.solve(tangent + shift * K, excess).astype(np.float64).reshape(-1, 4)
         except np.linalg.LinAlgError:
             return None
         if (

@@ -154,7 +154,7 @@ def _pose(half: HalfWing, xyz: Array, cov: Array, settings: FitSettings) -> _Pro
 
 @lru_cache(maxsize=16)
 def _strain_modes(half: HalfWing, settings: FitSettings) -> Array:
-    """The strains' prior as independent modes of unit variance (eqs. 22, 23): (4N, m).
+    """The strains' prior as independent modes of unit variance (eqs. 21 to 23): (4N, m).
 
     Along the span a Matérn 5/2 process, as moments under distributed loads are smooth; times a taper, as a free end
     carries no moment (a tenth is left there for loads on the tip).
