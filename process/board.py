@@ -70,7 +70,7 @@ class View:
 
 
 def read_grey(path: Path) -> Image:
-    """The image (H, W) of an 8-bit grey file. ProcessError if it is of another kind, truncated or blank."""
+    """The image (H, W) of an 8-bit grey file. ProcessError if it is of another kind or truncated."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -83,9 +83,13 @@ def read_grey(path: Path) -> Image:
     if image.dtype != np.uint8 or image.ndim != 2:
         kind = f"{image.dtype.itemsize * 8}-bit, {1 if image.ndim == 2 else image.shape[2]} channels"
         raise ProcessError(f"{path}: {kind}; give 8-bit grey images, as the cameras record them")
+    return np.asarray(image, np.uint8)
+
+
+def refuse_blank(path: Path, image: Image) -> None:
+    """ProcessError if nothing is to be seen in ``image``: the lens cap was on, or the exposure was far off."""
     if float(image.std()) < 1.0:
         raise ProcessError(f"{path}: blank, every pixel is about {image.mean():.0f}; leave this view out")
-    return np.asarray(image, np.uint8)
 
 
 def _is_whole(data: bytes) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.errors import ProcessError, UsageError
-from process.board import FINDERS, Board, View, find_corners, read_grey
+from process.board import FINDERS, Board, View, find_corners, read_grey, refuse_blank
 from process.bundle import Freedom, adjust
 from process.calibrate import (
     MIN_VIEWS,
@@ -144,6 +144,7 @@ def _map(jobs: Sequence[tuple[Path, Board]], workers: int):  # type: ignore[no-u
 def _find_one(job: tuple[Path, Board]) -> tuple[View, tuple[int, int]]:
     path, board = job
     image = read_grey(path)
+    refuse_blank(path, image)
     cv2.setNumThreads(1)
     return find_corners(path, image, board), (image.shape[1], image.shape[0])
 

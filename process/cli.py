@@ -5,9 +5,11 @@ import typer
 from capture.console import run
 from process.calibrate_command import calibrate
 from process.markers_command import markers
+from process.rig_command import rig
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="From recorded frames to 3-D markers.")
 app.command()(calibrate)
+app.command()(rig)
 app.command()(markers)
 
 
