@@ -89,8 +89,8 @@ def solve_pose(
     in_cam0 = np.full((len(names), 3), np.nan)
     in_cam0[seen] = triangulate_midpoint(pair, spots0.pixels[assigned[seen, 0]], spots1.pixels[assigned[seen, 1]])
     used = np.isfinite(in_cam0[:, 0])
-    for index in np.flatnonzero(seen & ~used):
-        reasons[index] = "the rays of its two spots do not meet"
+    for lone in np.flatnonzero(seen & ~used):
+        reasons[lone] = "the rays of its two spots do not meet"
     while True:
         if used.sum() < MIN_POINTS:
             detail = "; ".join(f"{name}: {reason}" for name, reason in zip(names, reasons, strict=True) if reason)
@@ -315,9 +315,9 @@ class _Problem:
         residuals, jacobian = self._residuals(moved, np.concatenate([np.zeros(6), solution.x[6:]]))
         by_light = np.hstack([residuals[: 4 * count].reshape(count, 4), residuals[4 * count :].reshape(count, 3)])
         chi2: Array = np.sum(by_light**2, axis=1)
-        covariance: Array = np.linalg.inv(jacobian.T @ jacobian)[:6, :6]
+        covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian)[:6, :6], np.float64)
         projected = np.stack(_project(self._pair, moved, self._surveyed + solution.x[6:].reshape(-1, 3)), axis=1)
-        return moved, chi2, covariance, self._pixels - projected
+        return moved, chi2, covariance, np.asarray(self._pixels - projected)
 
     def _residuals(self, T_start: Array, x: Array) -> tuple[Array, Array]:
         """Whitened residuals (7N,), pixels then survey, and their Jacobian (7N, 6 + 3N)."""
