@@ -171,7 +171,7 @@ def _print_report(report: FlightReport) -> None:
     seconds = (report.last_trigger_ns - report.first_trigger_ns) / 1e9
     flight = report.provenance.get("flight", "unnamed")
     say(f"{flight}: {report.triggers} triggers over {seconds:.2f} s, {size_gb:.2f} GB in {len(report.files)} files")
-    modes = ", ".join(sorted({file.provenance.get("write_mode", "unknown") for file in report.files}))
+    modes = ", ".join(report.write_modes)
     say(f"recorded by wingshape {report.provenance.get('version', 'unknown')}, write mode {modes}")
     table = Table("camera", "size", "recorded", "lost")
     for name, camera in sorted(report.cameras.items()):

@@ -65,6 +65,12 @@ class FlightReport:
         return sum(len(camera.lost_indices) for camera in self.cameras.values())
 
     @property
+    def write_modes(self) -> list[str]:
+        """How the frames went to the disk: direct, buffered, or both."""
+        segments = [file for file in self.files if not file.path.name.startswith("aux")]
+        return sorted({file.provenance.get("write_mode", "unknown") for file in segments})
+
+    @property
     def size_bytes(self) -> int:
         """Size of all files."""
         return sum(file.size for file in self.files)
@@ -93,7 +99,7 @@ class FlightReport:
                 {"path": str(file.path), "bytes": file.size, "chunks": file.chunks, "closed": file.closed}
                 for file in self.files
             ],
-            "write_modes": sorted({file.provenance.get("write_mode", "unknown") for file in self.files}),
+            "write_modes": self.write_modes,
             "flight": self.provenance.get("flight", ""),
             "version": self.provenance.get("version", ""),
             "problems": self.problems,
