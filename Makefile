@@ -4,13 +4,18 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= demo-out
 STAMP := $(VENV)/.installed
+PEERS := $(VENV)/.installed-peers
 
-.PHONY: demo test lint slow ci clean
+.PHONY: demo test lint slow evidence clean
 
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "wingshape needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 ..."; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { echo "python venv is missing: trying the system package"; apt-get update && apt-get install -y python3-venv && $(PYTHON) -m venv $(VENV); }
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+$(PEERS): $(STAMP)
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,peers]'
 	@touch $@
 
 demo: $(STAMP)
@@ -25,8 +30,11 @@ lint: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-slow: $(STAMP)
+slow: $(PEERS)
 	$(BIN)/pytest -m slow
+
+evidence: $(PEERS)
+	$(BIN)/python tests/evidence/collect.py
 
 clean:
 	rm -rf $(VENV) $(OUT)
