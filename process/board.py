@@ -254,12 +254,13 @@ def _why_unusable(image: Image, corners: Array, board: Board) -> str:
     spacing = corner_spacing_px(corners, board)
     if spacing < MIN_SPACING_PX:
         return f"the board is too small in the picture: {spacing:.1f} px between corners, {MIN_SPACING_PX:g} are needed"
+    not_a_grid = f"the corners found do not form a grid of {board.columns}x{board.rows} in a plane"
     fit, _ = cv2.findHomography(board.points_m, corners)
     if fit is None:
-        return "the corners found do not form a plane grid"
+        return not_a_grid
     plane = cv2.perspectiveTransform(board.points_m.reshape(1, -1, 2), fit).reshape(-1, 2)
     if np.linalg.norm(plane - corners, axis=1).max() > 0.5 * spacing:  # lens distortion bends it far less
-        return "the corners found do not form a plane grid"
+        return not_a_grid
     inside = _inside_squares(image, corners, board)
     contrast = abs(_square_brightness(image, corners, board))
     if np.mean(np.ptp(inside, axis=0) < 0.5 * contrast) < 0.8 or _goes_on(image, corners, board):

@@ -83,12 +83,15 @@ def adjust(corners_px: Array, start: Estimate, freedom: Freedom) -> Adjustment:
     Raises ProcessError if the views do not determine what is asked for, or the optimum is not reached.
     """
     space = _Space(start, freedom)
-    weight = 1.0 / np.sqrt(2 * corners_px[0, 0].size * corners_px.shape[1])
+    freedoms = corners_px.size - space.zero.size
+    if freedoms <= 0:
+        raise ProcessError("too few corners for this many unknowns; take more views of the board")
+    weight = 1.0 / np.sqrt(corners_px.size)
     solution = least_squares(
-        lambda x: weight * _residuals(space.estimate(x), corners_px).ravel(),
+        lambda x: weight * residuals_of(space.estimate(x), corners_px).ravel(),
         space.zero,
         jac=lambda x: weight * space.jacobian(x),
-        method="trf",
+        method="lm",
         x_scale="jac",
         xtol=1e-13,
         ftol=1e-15,
@@ -96,11 +99,10 @@ def adjust(corners_px: Array, start: Estimate, freedom: Freedom) -> Adjustment:
         max_nfev=MAX_EVALUATIONS,
     )
     estimate = space.estimate(solution.x)
-    residuals = _residuals(estimate, corners_px)
+    residuals = residuals_of(estimate, corners_px)
     jacobian = space.jacobian(solution.x)
-    freedoms = residuals.size - solution.x.size
-    if freedoms <= 0 or not np.all(np.isfinite(residuals)):
-        raise ProcessError("too few corners for this many unknowns; take more views of the board")
+    if not np.all(np.isfinite(residuals)):
+        raise ProcessError("the adjustment diverged; take more views of the board, tilted in different directions")
     columns = np.linalg.norm(jacobian, axis=0)
     length = np.linalg.norm(residuals)
     cosine = np.abs(jacobian.T @ residuals.ravel()) / np.maximum(columns * length, 1e-300)
@@ -183,7 +185,8 @@ def _board_freedom(board_m: Array) -> Array:
     return np.asarray(null_space(np.array(held)))
 
 
-def _residuals(estimate: Estimate, corners_px: Array) -> Array:
+def residuals_of(estimate: Estimate, corners_px: Array) -> Array:
+    """Projected minus measured pixels, (C, V, N, 2) as ``corners_px``."""
     return np.stack([_project(estimate, camera) for camera in range(len(corners_px))]) - corners_px
 
 

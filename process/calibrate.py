@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from capture.errors import ProcessError
 from process.board import Board
-from process.bundle import Adjustment, Estimate, Freedom, adjust, rms_px, rotation_matrix
+from process.bundle import Adjustment, Estimate, Freedom, adjust, residuals_of, rms_px, rotation_matrix
 from process.camera_model import CameraModel, StereoPair, pose_matrix
 
 Array = NDArray[np.float64]
@@ -23,6 +23,7 @@ MIN_VIEWS = 3
 MIN_VIEWS_FOR_PRINT = 6  # below it, the printed corners are not told from the lens: the nominal board is used
 MIN_TILT_DEG = 5.0
 OUTLIER_RATIO = 3.0
+DISAGREEMENT_RATIO = 6.0  # each camera alone is less sure of a view's distance: they disagree more than they fit
 SAME_OPTIMUM = 1.0 + 1e-4
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-12)
 
@@ -93,18 +94,37 @@ def calibrate(
             raise ProcessError(
                 f"{len(used)} usable views, at least {MIN_VIEWS} are needed" + (reasons and f" ({reasons})")
             )
-        check_poses_differ(corners_px[0, used], board, size_px)
-        stages = _solve(corners_px[:, used], board, size_px, settings)
-        view_rms = np.sqrt(np.mean(np.sum(stages.final.residuals_px**2, axis=-1), axis=(0, 2)))
-        worst = int(np.argmax(view_rms))
-        limit = OUTLIER_RATIO * float(np.median(view_rms))
-        if view_rms[worst] <= max(limit, 1e-6):
-            return _result(stages, board, size_px, settings, used, rejected)
-        rejected[int(used[worst])] = (
-            f"residual {view_rms[worst]:.2f} px, the others' median is {limit / OUTLIER_RATIO:.2f} px: "
-            "board moved between the two pictures, or they are not of the same instant"
-        )
+        seen = np.ascontiguousarray(corners_px[:, used], np.float64)  # OpenCV takes no other layout
+        check_poses_differ(seen[0], board, size_px)
+        alone = _alone(seen, board, size_px, settings)
+        start = _join([adjustment for adjustment, _ in alone])
+        if start.stereo[3] > 0.0:
+            raise ProcessError(
+                "cam0 and cam1 are swapped: cam1 must be the right one as the pair looks at the board; "
+                "exchange --cam0 and --cam1"
+            )
+        # first where the views disagree on the pose between the cameras: a full adjustment of few views bends to fit
+        odd = _odd_view(residuals_of(start, seen)[1:], DISAGREEMENT_RATIO)
+        if odd is None:
+            stages = _solve(seen, alone, start, size_px, settings)
+            odd = _odd_view(stages.final.residuals_px, OUTLIER_RATIO)
+            if odd is None:
+                return _result(stages, board, size_px, settings, used, rejected)
+        worst, reason = odd
+        rejected[int(used[worst])] = reason
         used = np.delete(used, worst)
+
+
+def _odd_view(residuals_px: Array, ratio: float) -> tuple[int, str] | None:
+    """The view with the largest residuals (C, V, N, 2), and what is odd about it; None if none stands out."""
+    view_rms = np.sqrt(np.mean(np.sum(residuals_px**2, axis=-1), axis=(0, 2)))
+    worst, median = int(np.argmax(view_rms)), float(np.median(view_rms))
+    if view_rms[worst] <= max(ratio * median, 1e-6):
+        return None
+    return worst, (
+        f"residual {view_rms[worst]:.2f} px, the views' median is {median:.2f} px: the board moved between the two "
+        "pictures, or they are not of the same instant"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,18 +135,25 @@ class _Stages:
     library_rms_px: tuple[float, float, float]
 
 
-def _solve(corners_px: Array, board: Board, size_px: tuple[int, int], settings: CalibrationSettings) -> _Stages:
-    library = [start_alone(corners, board, size_px, settings.distortion_terms) for corners in corners_px]
-    alone = [
-        adjust(corners[None], start, Freedom(distortion_terms=settings.distortion_terms))
-        for corners, (start, _) in zip(corners_px, library, strict=True)
+def _alone(
+    corners_px: Array, board: Board, size_px: tuple[int, int], settings: CalibrationSettings
+) -> list[tuple[Adjustment, float]]:
+    """Each camera alone on the nominal board, and the RMS at which OpenCV's own solver ended."""
+    freedom = Freedom(distortion_terms=settings.distortion_terms)
+    starts = [start_alone(corners, board, size_px, settings.distortion_terms) for corners in corners_px]
+    return [
+        (adjust(corners[None], start, freedom), library_rms_px)
+        for corners, (start, library_rms_px) in zip(corners_px, starts, strict=True)
     ]
-    start = _join(alone)
-    if start.stereo[3] > 0.0:
-        raise ProcessError(
-            "cam0 and cam1 are swapped: cam1 must be the right one as the pair looks at the board; "
-            "exchange --cam0 and --cam1"
-        )
+
+
+def _solve(
+    corners_px: Array,
+    alone: list[tuple[Adjustment, float]],
+    start: Estimate,
+    size_px: tuple[int, int],
+    settings: CalibrationSettings,
+) -> _Stages:
     two_stage = adjust(corners_px, start, Freedom(intrinsics=False))
     stereo_rms_px = _library_stereo_rms_px(corners_px, start, size_px)
     final = two_stage
@@ -134,7 +161,7 @@ def _solve(corners_px: Array, board: Board, size_px: tuple[int, int], settings: 
         board_moves = not settings.nominal_board and corners_px.shape[1] >= MIN_VIEWS_FOR_PRINT
         freedom = Freedom(distortion_terms=settings.distortion_terms, board=board_moves)
         final = adjust(corners_px, two_stage.estimate, freedom)
-    return _Stages(alone, two_stage, final, (library[0][1], library[1][1], stereo_rms_px))
+    return _Stages([one for one, _ in alone], two_stage, final, (alone[0][1], alone[1][1], stereo_rms_px))
 
 
 def start_alone(

@@ -24,7 +24,8 @@ MOUNT_ANGLE_DEG = 8.0  # how far the mount may be from what the survey says
 MOUNT_SHIFT_M = 0.10
 HYPOTHESES = 2000
 AGREE_PX = 12.0  # a hypothesis from three lights with survey errors predicts the others this well
-ASSIGN_PX = 25.0
+ENOUGH = 0.75  # of the best score: no need to look for a better hypothesis
+ASSIGN_PX = 60.0  # far enough for a light with a wrong coordinate to be named as such
 CHI2_LIMIT = 25.0  # of a light's 4 degrees of freedom: one good light in 20 000 is beyond
 MAX_ROTATION_SIGMA_DEG = 0.5
 
@@ -217,6 +218,8 @@ def _best_hypothesis(
         )
         if best is None or score > best[0]:
             best = (score, T)
+            if score > ENOUGH * 2 * len(seen):
+                break
     return None if best is None else best[1]
 
 
