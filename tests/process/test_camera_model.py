@@ -22,6 +22,16 @@ WIDE = CameraModel(2080, 1552, [[1403.0, 0, 1033.2], [0, 1401.5, 779.9], [0, 0, 
 LONG = CameraModel(2080, 1552, [[2701.0, 0, 1041.7], [0, 2703.5, 771.3], [0, 0, 1]], [-0.11, 0.14, -3e-4, 6e-4, 0.02])
 
 
+def undistorted(pixels, camera, R=None, P=None):
+    """OpenCV's own inverse of its lens model (N, 2), iterated to the end; its name differs between versions 4 and 5."""
+    source, criteria = pixels.reshape(-1, 1, 2), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+    if hasattr(cv2, "undistortPointsIter"):
+        found = cv2.undistortPointsIter(source, camera.K, camera.distortion, R, P, criteria)
+    else:
+        found = cv2.undistortPoints(source, camera.K, camera.distortion, R=R, P=P, criteria=criteria)
+    return found.reshape(-1, 2)
+
+
 def make_pair(covariance=None):
     return StereoPair(LONG, LONG, pose_matrix([0.004, -0.02, 0.003], [-0.2794, 0.001, -0.0005]), covariance)
 
@@ -48,9 +58,8 @@ def test_undistort_inverts_project_to_rounding(camera):
 
 def test_undistort_agrees_with_opencv():
     pixels = np.stack(np.meshgrid(np.linspace(0, 2079, 30), np.linspace(0, 1551, 30)), axis=-1).reshape(-1, 2)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
-    expected = cv2.undistortPoints(pixels.reshape(-1, 1, 2), LONG.K, LONG.distortion, criteria=criteria)
-    np.testing.assert_allclose(LONG.undistort(pixels), expected.reshape(-1, 2), atol=1e-10)
+    expected = undistorted(pixels, LONG)
+    np.testing.assert_allclose(LONG.undistort(pixels), expected, atol=1e-10)
 
 
 def test_jacobian_agrees_with_finite_differences():
@@ -86,13 +95,12 @@ def test_q_gives_the_point_that_direct_triangulation_gives():
     points = points_in_view(200)
     in_cam1 = points @ pair.T_cam1_cam0[:3, :3].T + pair.T_cam1_cam0[:3, 3]
     rectified = [
-        cv2.undistortPoints(camera.project(p).reshape(-1, 1, 2), camera.K, camera.distortion, R=R, P=P,
-                            criteria=(3, 200, 1e-14)).reshape(-1, 2)
+        undistorted(camera.project(p), camera, R, P)
         for camera, p, R, P in (
             (pair.cam0, points, pair.rectification.R0, pair.rectification.P0),
             (pair.cam1, in_cam1, pair.rectification.R1, pair.rectification.P1),
         )
-    ]  # fmt: skip
+    ]
     np.testing.assert_allclose(rectified[0][:, 1], rectified[1][:, 1], atol=1e-6)
     disparity = rectified[0][:, 0] - rectified[1][:, 0]
     homogeneous = np.stack([*rectified[0].T, disparity, np.ones(len(points))])

@@ -9,11 +9,20 @@ import pytest
 SUPERSAMPLING = 4
 
 
+def undistorted(pixels, camera):
+    """OpenCV's own inverse of its lens model (N, 2), iterated to 1e-10; its name differs between versions 4 and 5."""
+    source, criteria = pixels.reshape(-1, 1, 2), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
+    if hasattr(cv2, "undistortPointsIter"):
+        found = cv2.undistortPointsIter(source, camera.K, camera.distortion, None, None, criteria)
+    else:
+        found = cv2.undistortPoints(source, camera.K, camera.distortion, criteria=criteria)
+    return found.reshape(-1, 2)
+
+
 def draw_board(camera, board, T_cam_board, *, noise_grey=1.5, blur_px=0.7, seed=1):
     """8-bit image of ``board`` (one dark square at its first inner corner, white rim) as ``camera`` sees it."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
-    rays = cv2.undistortPoints(grid.reshape(-1, 1, 2), camera.K, camera.distortion, criteria=criteria).reshape(-1, 2)
+    rays = undistorted(grid, camera)
     H = T_cam_board[:3][:, [0, 1, 3]]
     plane = np.column_stack([rays, np.ones(len(rays))]) @ np.linalg.inv(H).T
     squares = (plane[:, :2] / plane[:, 2:] / board.square_m).reshape(camera.height, camera.width, 2)
