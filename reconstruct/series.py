@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from capture.errors import ReconstructError, UsageError
-from reconstruct.fit import Fit, fit_frame
+from reconstruct.fit import Fit, common_scale, fit_frame
 from reconstruct.instants import InstantMarkers, InstantSettings, at_common_instant
 from reconstruct.tables import Bools, Floats, Ints, MarkerSeries, Words
 from reconstruct.wing import HalfWing, Wing
@@ -64,6 +64,7 @@ class _Block:
     first: int
     xyz_m: Floats
     cov_m2: Floats
+    prior_scale: Floats | None
 
 
 def fit_series(
@@ -90,7 +91,7 @@ def fit_series(
         measured[side] = (series, at_common_instant(series, instants))
     if not any(moved.points.any() for _, moved in measured.values()):
         raise UsageError("no marker was measured in any set; look at the flags column of the marker table")
-    blocks = [block for side, (_, moved) in measured.items() for block in _blocks(side, moved)]
+    blocks = [block for side, (_, moved) in measured.items() for block in _blocks(wing, side, moved)]
     done: dict[str, dict[int, _Rows]] = {side: {} for side in measured}
     for block, rows in _fit_blocks(blocks, wing, workers or len(os.sched_getaffinity(0))):
         done[block.side][block.first] = rows
@@ -140,10 +141,13 @@ def _as_in(half: HalfWing, series: MarkerSeries) -> MarkerSeries:
     )
 
 
-def _blocks(side: str, moved: InstantMarkers) -> list[_Block]:
-    sets = moved.points.shape[0]
+def _blocks(wing: Wing, side: str, moved: InstantMarkers) -> list[_Block]:
+    sets, settings = moved.points.shape[0], _settings(wing)
+    scale = None
+    if settings.prior_weight == "data":
+        scale = common_scale(_half(wing, side), moved.xyz_m, moved.cov_m2, settings)
     return [
-        _Block(side, first, moved.xyz_m[first : first + BLOCK_SETS], moved.cov_m2[first : first + BLOCK_SETS])
+        _Block(side, first, moved.xyz_m[first : first + BLOCK_SETS], moved.cov_m2[first : first + BLOCK_SETS], scale)
         for first in range(0, sets, BLOCK_SETS)
     ]
 
@@ -153,7 +157,7 @@ def _fit_blocks(blocks: list[_Block], wing: Wing, workers: int) -> Iterator[tupl
     workers = min(workers, len(blocks))
     if workers <= 1:
         for block in blocks:
-            yield block, fit_block(_half(wing, block.side), _settings(wing), block.xyz_m, block.cov_m2)
+            yield block, _fit_block(wing, block)
         return
     spawn = multiprocessing.get_context("spawn")
     with (
@@ -196,18 +200,27 @@ def _set_wing(wing: Wing) -> None:
 
 def _fit_block_here(block: _Block) -> _Rows:
     assert _wing is not None
-    return fit_block(_half(_wing, block.side), _settings(_wing), block.xyz_m, block.cov_m2)
+    return _fit_block(_wing, block)
 
 
-def fit_block(half: HalfWing, settings: FitSettings, xyz_m: Floats, cov_m2: Floats) -> dict[str, Any]:
+def _fit_block(wing: Wing, block: _Block) -> _Rows:
+    half = _half(wing, block.side)
+    return fit_block(half, _settings(wing), block.xyz_m, block.cov_m2, block.prior_scale)
+
+
+def fit_block(
+    half: HalfWing, settings: FitSettings, xyz_m: Floats, cov_m2: Floats, prior_scale: Floats | None = None
+) -> dict[str, Any]:
     """Fit consecutive sets, each from the last one's fit (one that did not converge starts nothing).
+
+    The prior's scale is that given, or each set chooses its own.
 
     Returns what SideFits has of them, an array a field; the rest of a fit is dropped here, where it was made.
     """
     rows = []
     fit: Fit | None = None
     for xyz, cov in zip(xyz_m, cov_m2, strict=True):
-        fit = fit_frame(half, xyz, cov, settings, start=fit)
+        fit = fit_frame(half, xyz, cov, settings, start=fit, prior_scale=prior_scale)
         rows.append(_row(half, fit))
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 

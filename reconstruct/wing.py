@@ -46,6 +46,7 @@ class HalfWing:
     mass_kg: Array  # (P,) lumped: the structure's and what is mounted on it
     mass_node: Index  # (P,) int
     mass_offset_m: Array  # (P, 3) in the section frame
+    stiffness_sigma: Array  # (4,) relative: EA, GJ, EI_out, EI_in
 
     @property
     def sign(self) -> float:
@@ -78,7 +79,6 @@ class Wing:
     left: HalfWing
     right: HalfWing
     fit: FitSettings
-    stiffness_sigma: Array  # (4,) relative: EA, GJ, EI_out, EI_in
 
     def half(self, side: Side) -> HalfWing:
         """The half wing of that name."""
@@ -123,7 +123,6 @@ def read_wing(path: Path, nodes_at_m: tuple[float, ...] = ()) -> Wing:
 
 def build_wing(described: WingFile, nodes_at_m: tuple[float, ...] = ()) -> Wing:
     """The two half wings of a checked description."""
-    sigma = described.stiffness_sigma
     stations = [pair.station_m for pair in described.markers.pairs] + [mass.station_m for mass in described.mass]
     stations += [*(described.fit.load_stations_m if described.fit else ()), *nodes_at_m]
     segments, lengths = _mesh(described.segment, stations)
@@ -132,7 +131,6 @@ def build_wing(described: WingFile, nodes_at_m: tuple[float, ...] = ()) -> Wing:
         left=_half(described, segments, lengths, "left"),
         right=_half(described, segments, lengths, "right"),
         fit=described.fit or FitSettings(load_stations_m=_thirds(lengths)),
-        stiffness_sigma=np.array([sigma.EA, sigma.GJ, sigma.EI_out, sigma.EI_in]),
     )
 
 
@@ -186,6 +184,7 @@ def _half(described: WingFile, segments: list[SegmentSection], lengths: Array, s
         -1, 3
     )
     masses = _masses(described, segments, node_s, side)
+    sigma = described.stiffness_sigma
     return HalfWing(
         side=side,
         beam=beam,
@@ -197,6 +196,7 @@ def _half(described: WingFile, segments: list[SegmentSection], lengths: Array, s
         mass_kg=masses[0],
         mass_node=masses[1],
         mass_offset_m=masses[2],
+        stiffness_sigma=np.array([sigma.EA, sigma.GJ, sigma.EI_out, sigma.EI_in]),
     )
 
 

@@ -132,15 +132,24 @@ class FitSettings(Strict):
 
     loads: Literal["everywhere", "stations"] = "everywhere"  # at every node, or only at the stations (the paper's way)
     load_stations_m: Annotated[tuple[Positive, ...], Field(min_length=1)]  # where loads act, or are reported
-    twist_sigma_deg: Positive = 4.0
+    twist_sigma_deg: Positive = 3.0
     bend_out_sigma_deg: Positive = 40.0
     bend_in_sigma_deg: Positive | None = None  # None: out of plane's, times √(EI_out / EI_in)
     extension_sigma: Positive = 5e-5
-    correlation: Positive = 1.3  # in half spans: strains much closer than this are alike
+    correlation: Positive = 1.5  # in half spans: loads much closer than this are alike
     force_sigma_n: Positive = 30.0  # of each component at each station
     moment_sigma_nm: Positive = 5.0
-    marker_model_sigma_m: NotNegative = 0.0005  # added to every marker's covariance
+    prior_weight: Literal["data"] | NotNegative = "data"  # chosen by the data; 1 as stated; 0 none (stations only)
+    marker_model_sigma_m: NotNegative = 0.0002  # added to every marker's covariance
     outlier_sigma: Positive = 4.6  # a marker farther off than this (χ² of 3, p = 1e-4) is left out
+
+    @model_validator(mode="after")
+    def _loads_everywhere_need_a_prior(self) -> "FitSettings":
+        if self.loads == "everywhere" and self.prior_weight == 0:
+            raise ValueError(
+                'prior_weight = 0 needs loads = "stations": loads at every node are too many without prior'
+            )
+        return self
 
 
 class WingFile(Strict):
