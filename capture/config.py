@@ -35,6 +35,7 @@ class DiskConfig(_Table):
     segment_mb: Annotated[float, Field(gt=0)] = 8000.0
     reserve_mb: Annotated[float, Field(ge=0)] = 500.0
     write: Literal["auto", "direct", "buffered"] = "auto"
+    takeover: bool = False  # when a disk fails, its side goes on on the other one
 
 
 class RingConfig(_Table):

@@ -216,19 +216,13 @@ class Recording:
             lock_memory=self._config.ring.lock_memory,
             calibration=self._config.calibration,
         )
-        for side in SIDES:
+        sides = [side for side in SIDES if any(place[0] == side for place in self._cameras)]
+        folders = {side: self._make_folder(side) for side in sides}
+        for side in sides:
             cameras = {name: camera for (camera_side, name), camera in self._cameras.items() if camera_side == side}
-            if not cameras:
-                continue
-            disk: Path = getattr(self._config.disks, side)
-            folder = disk / self.flight
-            try:
-                self._disk.make_folder(folder)
-            except OSError as error:
-                raise DiskError(
-                    f"{disk}: cannot be written ({error.strerror}): mount the disk, or correct `disks.{side}`"
-                ) from error
-            self._lanes[side] = make_lane(side, folder, cameras, parts)
+            other = next((folders[s] for s in sides if s != side), None)
+            spare = (self._disk, other) if self._config.disks.takeover and other is not None else None
+            self._lanes[side] = make_lane(side, folders[side], cameras, parts, spare)
         rings = [grabber.ring for grabber in self._grabbers.values()]
         total_mb = sum(ring.slots * ring.slot_bytes for ring in rings) / 1e6
         locked = all(ring.locked for ring in rings)
@@ -237,6 +231,17 @@ class Recording:
             f"{'locked in memory' if locked else 'not locked in memory (RLIMIT_MEMLOCK)'}: "
             f"bridges a disk stall of {self._config.ring.stall_s:g} s"
         )
+
+    def _make_folder(self, side: str) -> Path:
+        disk: Path = getattr(self._config.disks, side)
+        folder = disk / self.flight
+        try:
+            self._disk.make_folder(folder)
+        except OSError as error:
+            raise DiskError(
+                f"{disk}: cannot be written ({error.strerror}): mount the disk, or correct `disks.{side}`"
+            ) from error
+        return folder
 
     def _control(self, board: TriggerBoard, stop: StopRule, started_s: float) -> None:
         next_report_s = started_s + DIAGNOSTICS_PERIOD_S
@@ -302,18 +307,24 @@ class Recording:
             if recorder.running:  # hung in a write: its files stay as they are, for `wingcap recover`
                 continue
             recorder.close(last, end)
+            if recorder.moved is not None:
+                self._failures.append(f"{recorder.moved}; {recorder.side} went on in {recorder.folder}")
             if recorder.failure is not None:
                 self._failures.append(str(recorder.failure))
-            with contextlib.suppress(OSError):  # the failing disk; its files are readable without
-                self._disk.write_text(
-                    recorder.folder / "metadata.yaml", metadata_yaml([*recorder.segments, recorder.aux])
-                )
+        self._write_metadata()
         return self._result(next_index - first_index, seconds)
+
+    def _write_metadata(self) -> None:
+        writers = [writer for r in self._recorders.values() for writer in (*r.segments, r.aux)]
+        for folder in {writer.path.parent for writer in writers}:
+            here = [writer for writer in writers if writer.path.parent == folder]
+            with contextlib.suppress(OSError):  # a disk that has failed; its files are readable without
+                self._disk.write_text(folder / "metadata.yaml", metadata_yaml(here))
 
     def _result(self, triggers: int, seconds: float) -> RecordingResult:
         return RecordingResult(
             flight=self.flight,
-            folders=[recorder.folder for recorder in self._recorders.values()],
+            folders=[recorder.aux.path.parent for recorder in self._recorders.values()],
             triggers=triggers,
             accounts=self._ledger.accounts(),
             write_modes={side: recorder.write_mode for side, recorder in self._recorders.items()},
@@ -350,9 +361,9 @@ class Recording:
         ]
         statuses += [
             Diagnostic(
-                2 if recorder.failure else 0,
+                2 if recorder.failure or recorder.moved else 0,
                 f"disk {side}",
-                str(recorder.failure) if recorder.failure else recorder.write_mode,
+                str(recorder.failure or recorder.moved or recorder.write_mode),
                 (("queued", str(recorder.queued)), ("last_write_us", str(recorder.statistics.last_us))),
             )
             for side, recorder in self._recorders.items()

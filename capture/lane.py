@@ -49,9 +49,15 @@ class Lane:
 
 
 def make_lane(
-    side: str, folder: Path, cameras: Mapping[str, tuple[Camera, CameraDescription]], parts: LaneParts
+    side: str,
+    folder: Path,
+    cameras: Mapping[str, tuple[Camera, CameraDescription]],
+    parts: LaneParts,
+    spare: tuple[Disk, Path] | None = None,
 ) -> Lane:
     """Rings, read threads and the write thread of one side; nothing is started yet.
+
+    ``spare`` is the folder on the other disk where this side goes on when its own fails; None: it ends.
 
     Raises:
         DiskError: the first files cannot be made in ``folder``.
@@ -70,6 +76,7 @@ def make_lane(
         parts.clock,
         queue_bound=len(names) * parts.ring_slots,
         calibration=parts.calibration,
+        spare=spare,
     )
     ids = {channel.topic: channel.id for channel in camera_channels(names, side)}
     layouts = {

@@ -93,11 +93,13 @@ class Recorder(Worker):
         clock: Clock,
         queue_bound: int,
         calibration: Path | None = None,
+        spare: tuple[Disk, Path] | None = None,
     ) -> None:
         super().__init__(f"write-{side}")
         self.side = side
         self.folder = folder
-        self.failure: DiskError | None = None
+        self.failure: DiskError | None = None  # this side has ended
+        self.moved: DiskError | None = None  # its own disk has failed, and it went on on the other
         self.statistics = WriteStatistics()
         self.segments: list[SegmentWriter] = []
         self.aux_dropped = 0
@@ -110,6 +112,7 @@ class Recorder(Worker):
         self._ledger = ledger
         self._clock = clock
         self._calibration = calibration
+        self._spare = spare
         self._queue: queue.Queue[FrameItem | AuxItem] = queue.Queue(queue_bound + AUX_QUEUE)
         self._segment_started_s = 0.0
         self._current: SegmentWriter | None = None
@@ -167,26 +170,34 @@ class Recorder(Worker):
             self.aux.write_metadata("wingshape_end", end)
             self.aux.close()
         except DiskError as error:
-            self._fail(error)
+            self._fail_aux(error)
             self.aux.close_cut()
 
     def _take_frame(self, item: FrameItem) -> None:
-        if self.failure is None:
+        if self._write_somewhere(item):
+            self._ledger.recorded(item.place, item.index)
+        else:
+            self._ledger.lost(item.place, item.index, LossStage.DISK, str(self.failure))
+        item.ring.give_back(item.slot)
+
+    def _write_somewhere(self, item: FrameItem) -> bool:
+        """On this side's disk, or once more on the other where that one takes over."""
+        for _ in range(2):
+            if self.failure is not None:
+                return False
             try:
                 self._write(item)
+                return True
             except DiskError as error:
                 self._fail(error)
-        if self.failure is not None:
-            self._ledger.lost(item.place, item.index, LossStage.DISK, str(self.failure))
-        else:
-            self._ledger.recorded(item.place, item.index)
-        item.ring.give_back(item.slot)
+        return False
 
     def _write(self, item: FrameItem) -> None:
         segment = self._segment_with_room()
         if self._clock.monotonic_s() - self._synced_s > SYNC_PERIOD_S:
             segment.sync()
-            self.aux.sync()
+            if self.moved is None:  # else the aux file is on the disk that has failed
+                self.aux.sync()
             self._synced_s = self._clock.monotonic_s()
         begin_s = self._clock.monotonic_s()
         segment.write_frame(item.sealed)
@@ -202,7 +213,7 @@ class Recorder(Worker):
             self.aux.write_batch(item.messages)
         except DiskError as error:
             self.aux_dropped += len(item.messages)
-            self._fail(error)
+            self._fail_aux(error)
 
     def _segment_with_room(self) -> SegmentWriter:
         if self.statistics.frames % _SPACE_CHECK_EVERY == 0:
@@ -260,9 +271,18 @@ class Recorder(Worker):
             )
 
     def _fail(self, error: DiskError) -> None:
-        """This side is over: what is on the disk stays readable, the other side goes on."""
-        if self.failure is None:
-            self.failure = error
+        """The disk has failed: what is on it stays readable. Go on on the other disk where there is a spare folder,
+        else this side is over."""
         if self._current is not None:
             self._current.close_cut()
             self._current = None
+        if self._spare is not None:
+            (self._disk, self.folder), self._spare = self._spare, None
+            self.moved = error
+        elif self.failure is None:
+            self.failure = error
+
+    def _fail_aux(self, error: DiskError) -> None:
+        """The small messages are on the other disk too; a side that has moved there needs its own no more."""
+        if self.moved is None:
+            self._fail(error)

@@ -1,6 +1,8 @@
 """The recorder end to end on a rig of fakes: what was shown is in the files, what was lost is booked, byte for byte."""
 
+import errno
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from capture.config import load_config
 from capture.daemon import Recording, RecordingResult, StopRule
 from capture.disk import SystemDisk
 from capture.errors import CameraError, TriggerBoardError, UsageError
+from capture.recover import recover_flight
 from capture.verify import inspect
 
 TRIGGERS = 25
@@ -127,6 +130,61 @@ def test_a_full_disk_ends_its_side_only(write_config, rig, tmp_path, monkeypatch
     assert lost["left/cam0"] == {"disk": TRIGGERS}
     assert lost["right/cam0"] == lost["right/cam1"] == {}
     assert "free" in result.failures[0]
+
+
+def test_the_other_disk_takes_over_where_configured(write_config, rig, tmp_path, pixels_of):
+    monkeypatch = pytest.MonkeyPatch()
+    real, writes = SystemDisk.create, []
+
+    def create(self, path, mode, preallocate_bytes):
+        file = real(self, path, mode, preallocate_bytes)
+        if path.name == "left_0000.mcap":
+            write = file.write
+
+            def failing(data):
+                writes.append(1)
+                if len(writes) > 12:
+                    raise OSError(errno.EIO, "Input/output error")
+                return write(data)
+
+            file.write = failing
+        return file
+
+    monkeypatch.setattr(SystemDisk, "create", create)
+    result = record(write_config(disks="takeover = true"))
+    assert (result.recorded, result.lost) == (4 * TRIGGERS, 0)
+    assert "Input/output error" in result.failures[0]
+    assert (tmp_path / "ssd_right/test/left_0001.mcap").exists()
+    monkeypatch.undo()
+    recover_flight([tmp_path / "ssd_left", tmp_path / "ssd_right"], tmp_path / "copy")
+    assert inspect([tmp_path / "copy"]).recorded == 4 * TRIGGERS
+    frames = frames_of(tmp_path / "copy/0_test") | frames_of(tmp_path / "copy/1_test")
+    assert all(pixels == pixels_of(camera, index).tobytes() for (camera, index), pixels in frames.items())
+
+
+def test_a_disk_that_stalls_for_two_seconds_loses_nothing(write_config, rig, tmp_path, monkeypatch):
+    real, stalled = SystemDisk.create, []
+
+    def create(self, path, mode, preallocate_bytes):
+        file = real(self, path, mode, preallocate_bytes)
+        write = file.write
+
+        def stalling(data):
+            if path.name == "left_0000.mcap" and len(data) > 4096 and len(stalled) == 9:
+                time.sleep(2.0)
+            stalled.append(path.name) if path.name == "left_0000.mcap" else None
+            return write(data)
+
+        file.write = stalling
+        return file
+
+    monkeypatch.setattr(SystemDisk, "create", create)
+    config = write_config(rate_hz=25)
+    config.write_text(config.read_text().replace("stall_s = 0.5", "stall_s = 2.0"))
+    result = record(config, triggers=75)
+    assert (result.recorded, result.lost) == (300, 0)
+    assert max(result.ring_high_water.values()) > 45
+    assert inspect([tmp_path]).problems == []
 
 
 @pytest.mark.parametrize("write", ["auto", "buffered"])

@@ -73,6 +73,7 @@ class Plan:
     end: str = "stop"  # or kill, power cut
     end_at_write: int = NOTHING
     segment_mb: float = 1e3
+    takeover: bool = False
 
     @classmethod
     def of(cls, seed: int) -> "Plan":
@@ -109,6 +110,7 @@ class Plan:
             plan.end = draw.choice(["kill", "power cut"])
             plan.end_at_write = draw.randint(5, 4 * plan.triggers)
         plan.segment_mb = draw.choice([0.05, 0.1, 1e3])
+        plan.takeover = draw.random() < 0.4
         return plan
 
     def faults(self) -> Counter[str]:
@@ -350,7 +352,9 @@ class Simulation:
                 lock_memory=False,
             )
             pair = {name: (self.cameras[side, name], self.cameras[side, name].open()) for name in CAMERAS}
-            self.lanes[side] = make_lane(side, Path(f"/{side}"), pair, parts)
+            other = "right" if side == "left" else "left"
+            spare = (self.disks[other], Path(f"/{other}")) if self.plan.takeover else None
+            self.lanes[side] = make_lane(side, Path(f"/{side}"), pair, parts, spare)
             for grabber in self.lanes[side].grabbers.values():
                 grabber.arm()
         for index in range(self.plan.triggers):
@@ -460,6 +464,8 @@ class Simulation:
             for index in range(self.plan.triggers):
                 if index in camera.indices and self._cannot_be_recorded(place, index):
                     found.append(f"{place} trigger {index} is recorded, but the camera never gave it")
+        if self.plan.takeover and self.lost["disk"] and not all(disk.broken for disk in self.disks.values()):
+            found.append(f"{self.lost['disk']} frames lost at the disk although the other one could take over")
         return found + self._wrong_contents(folder)
 
     @property
