@@ -6,7 +6,7 @@ OUT ?= demo-out
 STAMP := $(VENV)/.installed
 PEERS := $(VENV)/.installed-peers
 
-.PHONY: demo test lint slow evidence clean
+.PHONY: demo test lint slow docs evidence clean
 
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "wingshape needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 ..."; exit 1; }
@@ -32,6 +32,9 @@ lint: $(STAMP)
 
 slow: $(PEERS)
 	$(BIN)/pytest -m slow
+
+docs: $(STAMP)
+	$(BIN)/python tests/support/command_reference.py
 
 evidence: $(PEERS)
 	$(BIN)/python tests/evidence/collect.py
