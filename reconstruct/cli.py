@@ -17,6 +17,8 @@ from typer.core import TyperGroup
 
 from capture.console import note, run, say, say_json
 from capture.errors import UsageError
+from reconstruct.plan import plan
+from reconstruct.reference import parse_window
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, REPORT, read_result
 from reconstruct.run import Job, Progress, run_comparison, run_job
@@ -54,6 +56,13 @@ def run_command(
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="rig.json of this flight's cameras; needed for frames.")] = None,
     markers: Annotated[Path | None, typer.Option(help="Start from this marker table instead of frames.")] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="Count displacements from this result, at rest, instead of the unloaded wing."),
+    ] = None,
+    reference_window: Annotated[
+        str | None, typer.Option(help="Count displacements from the mean of these seconds of this recording, A:B.")
+    ] = None,
     csv: Annotated[bool, typer.Option(help="Write the tables as CSV too.")] = True,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
@@ -63,7 +72,10 @@ def run_command(
     _check_files({"--rig": rig, "--wing": wing, "--markers": table})
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: is a file; give a folder for the result")
-    job = Job(tuple(flights), rig, table, wing, out, csv, workers, _command())
+    if reference is not None and reference_window is not None:
+        raise UsageError("give --reference or --reference-window, not both")
+    at_rest = parse_window(reference_window) if reference_window is not None else reference
+    job = Job(tuple(flights), rig, table, wing, out, csv, workers, _command(), at_rest)
     with _progress() as progress:
         summary, warnings = run_job(job, progress)
     if json:
@@ -125,6 +137,7 @@ def report_command(
 
 
 app.command("static")(static)
+app.command("plan")(plan)
 
 
 @app.command("example")

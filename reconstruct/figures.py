@@ -91,8 +91,8 @@ def _tip(result: Result, between_s: tuple[float, float]) -> Figure:
             axes, (("tip_dz_m", 1e3), ("tip_dx_m", 1e3), ("tip_twist_deg", 1.0)), strict=True
         ):
             _band(axis, time, scale * side.frames[value], scale * side.frames[f"sigma_{value}"], name)
-    axes[0].set(title="Tip displacement from the unloaded wing, up", ylabel="mm")
-    axes[1].set(title="Tip displacement from the unloaded wing, aft", ylabel="mm")
+    axes[0].set(title=f"Tip displacement from the {result.reference}, up", ylabel="mm")
+    axes[1].set(title=f"Tip displacement from the {result.reference}, aft", ylabel="mm")
     axes[2].set(title="Tip twist, nose-up", ylabel="deg", xlabel=_time_label(result))
     _legend(axes[0])
     return figure
@@ -104,8 +104,9 @@ def span(result: Result) -> Figure:
     grid = figure.subplots(2, len(result.sides), sharex="col", sharey="row", squeeze=False)
     instants = chosen_sets(result)
     for column, (name, side) in enumerate(result.sides.items()):
-        lift = 1e3 * (side.shape.xyz_m - side.unloaded_xyz_m)[..., 2]
-        for axis, values in zip(grid[:, column], (lift, side.shape.twist_deg), strict=True):
+        lift = 1e3 * (side.shape.xyz_m - side.reference_xyz_m)[..., 2]
+        twist = side.shape.twist_deg - side.reference_twist_deg
+        for axis, values in zip(grid[:, column], (lift, twist), strict=True):
             _envelope(axis, side.shape.s_m, values)
             for (label, triggers), colour in zip(instants.items(), INSTANT_COLOURS, strict=False):
                 row = np.flatnonzero(side.shape.trigger_index == triggers[name])[0]

@@ -90,6 +90,16 @@ def fit_frame(
         the fit; with NaN and a reason when fewer than three markers were measured, the iteration does not settle, or
         less than half of the markers agree with it.
     """
+    posed = marker_problem(half, marker_xyz_m, marker_cov_m2, settings)
+    fit = fit_measured(posed, settings, start, prior_scale)
+    if not fit.converged:
+        return fit
+    placed = marker_places(half, fit)
+    return replace(fit, residual_m=np.where(posed.problem.seen[:, None], marker_xyz_m - placed, np.nan))
+
+
+def marker_problem(half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, settings: FitSettings) -> Unscaled:
+    """The problem of markers at known places (M, 3), with covariances (M, 3, 3); NaN where not measured."""
     markers = len(half.marker_ids)
     if marker_xyz_m.shape != (markers, 3) or marker_cov_m2.shape != (markers, 3, 3):
         raise ValueError(f"expected {markers} markers, got shapes {marker_xyz_m.shape} and {marker_cov_m2.shape}")
@@ -103,11 +113,7 @@ def fit_frame(
     def measure(point: Array) -> tuple[Array, Array]:
         return (whiten @ (point - xyz)[:, :, None])[:, :, 0], whiten
 
-    fit = fit_measured(pose(half, settings, measure, seen, 3.0 * seen.astype(np.float64)), settings, start, prior_scale)
-    if not fit.converged:
-        return fit
-    placed = marker_places(half, fit)
-    return replace(fit, residual_m=np.where(seen[:, None], xyz - placed, np.nan))
+    return pose(half, settings, measure, seen, 3.0 * seen.astype(np.float64))
 
 
 def common_scale(half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, settings: FitSettings) -> Array:

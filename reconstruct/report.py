@@ -42,7 +42,7 @@ PLATES = (
     Plate(
         "tip",
         "The wing",
-        "The outermost station in time, against the unloaded wing. Bands are two sigma, as the fit states them. Of a "
+        "The outermost station in time. Bands are two sigma, as the fit states them. Of a "
         "long flight, this is the part around the highest position.",
         figures.tip,
     ),
@@ -173,7 +173,8 @@ def _head(result: Result) -> str:
     words = verdict(summary)
     grade = {"Good.": "good", "Poor.": "poor"}.get(words[0], "care")
     when = str(summary["start_utc"])[:19].replace("T", " ")
-    sub = f"{when} UTC, {summary['duration_s']:.1f} s, {summary['triggers']} triggers, {_and(summary['sides'])} wing"
+    amount = f"{summary['duration_s']:.1f} s, {summary['triggers']} triggers, {_and(summary['sides'])} wing"
+    sub = f"{when} UTC, {amount}; displacements are from the {result.reference}"
     cards = [
         ("sets fitted", f"{summary['converged_percent']:.1f} %", f"of {summary['sets']}"),
         ("markers measured", f"{summary['markers_seen_percent']:.1f} %", "of all markers in all sets"),
@@ -201,8 +202,22 @@ def _head(result: Result) -> str:
             ("sigma of the tip's twist, median", "sigma_tip_twist_deg", "°"),
         )
     ]
-    parts.append(_table(columns, rows))
+    parts.append(_table(columns, [*rows, *_stiffness_rows(summary)]))
     return "".join(parts)
+
+
+def _stiffness_rows(summary: Any) -> list[tuple[str, ...]]:
+    """How far the stiffness found lies from the wing file's, where loads at stations let it be found."""
+    rows = []
+    for key in ("GJ", "EI_out", "EI_in"):
+        cells = []
+        for side in summary["sides"]:
+            change = summary["by_side"][side].get("stiffness_change_percent", {}).get(key)
+            sigma = summary["by_side"][side].get("sigma_stiffness_percent", {}).get(key)
+            cells.append(f"{_number(change, '%', sign=True)} ± {_number(sigma, '%')}" if change and sigma else "–")
+        if any(cell != "–" for cell in cells):
+            rows.append((f"{key} found, against the wing file", *cells))
+    return rows
 
 
 def _compared_head(comparison: Any) -> str:

@@ -16,6 +16,7 @@ from reconstruct.tables import (
     MARKERS,
     NET_COLUMNS,
     POSITION,
+    REFERENCE_POSITION,
     RESIDUAL,
     RESIDUALS,
     SHAPE,
@@ -56,6 +57,8 @@ class SideResult:
 
     shape: ShapeSeries
     unloaded_xyz_m: Floats  # (S, 3) body frame
+    reference_xyz_m: Floats  # (S, 3) what displacements are counted from, body frame
+    reference_twist_deg: Floats  # (S,) its twist against the unloaded wing
     markers: MarkerSeries
     frames: Mapping[str, Floats]  # column of frames.parquet → (F,)
     reasons: Words  # (F,) str, why a set could not be fitted
@@ -84,6 +87,11 @@ class Result:
     errors: Mapping[str, SideErrors] = field(default_factory=dict)
 
     @property
+    def reference(self) -> str:
+        """What displacements are counted from."""
+        return str(self.summary.get("reference", "unloaded wing"))
+
+    @property
     def start_ns(self) -> int:
         """The first set's instant."""
         return min(int(side.shape.timestamp_ns[0]) for side in self.sides.values())
@@ -101,7 +109,7 @@ def read_result(folder: Path, comparison: Path | None = None) -> Result:
     shapes = shape_series(read_table(folder / SHAPE, ()), str(folder / SHAPE))
     frames = read_table(folder / FRAMES, ("trigger_index", "side", "reason", *_FRAME_NUMBERS))
     residuals = read_table(folder / RESIDUALS, ("trigger_index", "side", "marker", "used", *RESIDUAL))
-    unloaded = read_table(folder / UNLOADED, ("side", *POSITION))
+    unloaded = read_table(folder / UNLOADED, ("side", *POSITION, *REFERENCE_POSITION, "reference_twist_deg"))
     sides = {}
     for side, shape in shapes.items():
         if side not in markers:
@@ -138,6 +146,8 @@ def _side(
     return SideResult(
         shape,
         _dense(unloaded, side, POSITION, (shape.s_m.size, 3), folder / UNLOADED),
+        _dense(unloaded, side, REFERENCE_POSITION, (shape.s_m.size, 3), folder / UNLOADED),
+        _dense(unloaded, side, ("reference_twist_deg",), (shape.s_m.size,), folder / UNLOADED),
         markers,
         {name: _dense(frames, side, (name,), (sets,), folder / FRAMES) for name in _FRAME_NUMBERS},
         np.array(_of_side(frames, side).column("reason").to_pylist(), dtype=object),

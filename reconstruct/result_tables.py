@@ -7,11 +7,13 @@ import pyarrow as pa
 
 from reconstruct.series import SideFits
 from reconstruct.tables import (
+    CURVATURE,
     FRAMES,
     LOAD_COLUMNS,
     LOADS,
     NET_COLUMNS,
     POSITION,
+    REFERENCE_POSITION,
     RESIDUAL,
     RESIDUALS,
     SHAPE,
@@ -46,6 +48,8 @@ def shape_table(fits: SideFits) -> pa.Table:
             "twist_deg": np.degrees(fits.twist_rad).ravel(),
             **_flat(SIGMA, fits.sigma_xyz_m),
             "sigma_twist_deg": np.degrees(fits.sigma_twist_rad).ravel(),
+            **_flat(CURVATURE, fits.curvature_1pm),
+            **_flat([f"sigma_{name}" for name in CURVATURE], fits.sigma_curvature_1pm),
             "flags": _text(np.repeat(fits.flags, fits.s_m.size)),
         }
     )
@@ -53,7 +57,8 @@ def shape_table(fits: SideFits) -> pa.Table:
 
 def frames_table(fits: SideFits) -> pa.Table:
     """One row a trigger: the tip, the net load, how well the fit agrees with its markers."""
-    tip = np.column_stack([(fits.xyz_m - fits.unloaded_xyz_m)[:, -1], np.degrees(fits.twist_rad[:, -1])])
+    twist = np.degrees((fits.twist_rad - fits.reference_twist_rad)[:, -1])
+    tip = np.column_stack([(fits.xyz_m - fits.reference_xyz_m)[:, -1], twist])
     sigma_tip = np.column_stack([fits.sigma_xyz_m[:, -1], np.degrees(fits.sigma_twist_rad[:, -1])])
     residual = np.where(fits.used, np.linalg.norm(fits.residual_m, axis=-1), np.nan)
     return pa.table(
@@ -110,6 +115,9 @@ def unloaded_table(fits: SideFits) -> pa.Table:
             "station": np.arange(fits.s_m.size, dtype=np.int32),
             "s_m": fits.s_m,
             **_flat(POSITION, fits.unloaded_xyz_m),
+            **_flat(REFERENCE_POSITION, fits.reference_xyz_m),
+            "reference_twist_deg": np.degrees(fits.reference_twist_rad),
+            "reference": _text([fits.reference] * fits.s_m.size),
         }
     )
 

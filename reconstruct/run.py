@@ -8,6 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from capture.errors import ReconstructError, UsageError
@@ -16,13 +17,16 @@ from process.json_file import provenance, write_json
 from process.pipeline import markers as measure_markers
 from process.tables import write_table
 from reconstruct.compare import Comparison, compare
+from reconstruct.identify import identify
+from reconstruct.iteration import FEWEST_MARKERS
+from reconstruct.reference import Reference, refer
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_result
 from reconstruct.result_tables import result_tables
 from reconstruct.series import SideFits, fit_series
 from reconstruct.summary import summarise
 from reconstruct.tables import MARKERS, UNLOADED, marker_series, read_table, write_csv
-from reconstruct.wing import read_wing
+from reconstruct.wing import Wing, read_wing
 
 Progress = Callable[[str, int, int], None]
 """told the stage, what is done of it, and how much there is"""
@@ -40,6 +44,7 @@ class Job:
     csv: bool
     workers: int | None  # None: one a core
     command: str  # as it is recorded in the files
+    reference: Reference = None  # what displacements are counted from; None: the unloaded wing
 
 
 def run_job(job: Job, progress: Progress) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -60,7 +65,7 @@ def run_job(job: Job, progress: Progress) -> tuple[dict[str, Any], tuple[str, ..
         done += count
         progress("fit", done, total)
 
-    fits = fit_series(series, wing, workers=job.workers, progress=fitted)
+    fits = refer(fit_series(series, wing, workers=job.workers, progress=fitted), job.reference)
     fit_end = time.monotonic()
     _write_tables(job, table, fits, inputs)
     written = time.monotonic()
@@ -69,6 +74,7 @@ def run_job(job: Job, progress: Progress) -> tuple[dict[str, Any], tuple[str, ..
         "version": version("wingshape"),
         "wing": wing.name,
         **summarise(fits),
+        "warnings": _warnings(wing, fits),
         "timing_s": {"markers": measured - began, "fit": fit_end - measured, "tables": written - fit_end},
         "wall_s": written - began,
         "command": how["command"],
@@ -112,6 +118,20 @@ def _measure(job: Job, progress: Progress) -> tuple[pa.Table, str, list[Path], t
         job.flights, rig, progress=lambda done, total: progress("markers", done, total), workers=job.workers
     )
     return found.table, " ".join(str(path) for path in job.flights), [job.wing, job.rig], found.problems
+
+
+def _warnings(wing: Wing, fits: dict[str, SideFits]) -> list[str]:
+    """What the wing's markers, with the noise they had, cannot tell."""
+    said: dict[str, None] = {}
+    for side, own in fits.items():
+        known = np.asarray(np.isfinite(own.markers.cov_m2).all(axis=(-1, -2)))
+        cov = np.full(own.markers.cov_m2.shape[1:], np.nan)
+        for marker in range(known.shape[1]):
+            if known[:, marker].any():
+                cov[marker] = np.median(own.markers.cov_m2[:, marker][known[:, marker]], axis=0)
+        if np.isfinite(cov[:, 0, 0]).sum() >= FEWEST_MARKERS:
+            said.update(dict.fromkeys(identify(wing.half(side), wing.fit, cov).warnings))  # type: ignore[arg-type]
+    return list(said)
 
 
 def _write_tables(job: Job, table: pa.Table, fits: dict[str, SideFits], inputs: Sequence[Path]) -> None:

@@ -21,6 +21,7 @@ from reconstruct.wing_file import FitSettings
 _Rows = dict[str, Any]  # field of SideFits → array over a block's sets
 
 BLOCK_SETS = 20  # sets fitted one after the other with warm starts; fixed, so that workers do not change results
+UNLOADED_WING = "unloaded wing"
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -33,10 +34,17 @@ class SideFits:
     timestamp_ns: Ints  # (F,) the set's common instant
     s_m: Floats  # (N + 1,)
     unloaded_xyz_m: Floats  # (N + 1, 3) body frame
+    reference: str  # what displacements are counted from,
+    reference_xyz_m: Floats  # (N + 1, 3) where that is, body frame,
+    reference_twist_rad: Floats  # (N + 1,) and its twist against the unloaded wing
     xyz_m: Floats  # (F, N + 1, 3) body frame
     sigma_xyz_m: Floats  # (F, N + 1, 3)
     twist_rad: Floats  # (F, N + 1)
     sigma_twist_rad: Floats  # (F, N + 1)
+    curvature_1pm: Floats  # (F, N + 1, 3) elastic: twist, out-of-plane, in-plane; mean of the elements at a node
+    sigma_curvature_1pm: Floats  # (F, N + 1, 3)
+    stiffness_change: Floats  # (F, 4) relative, as found; zero where loads act everywhere
+    sigma_stiffness: Floats  # (F, 4)
     markers: MarkerSeries  # what was fitted: the wing's M markers in its order
     residual_m: Floats  # (F, M, 3) measured minus fitted; NaN where not measured
     used: Bools  # (F, M) False also for outliers
@@ -232,6 +240,10 @@ def _row(half: HalfWing, fit: Fit) -> dict[str, Any]:
         "sigma_xyz_m": fit.sigma_position_m,
         "twist_rad": fit.twist_rad,
         "sigma_twist_rad": fit.sigma_twist_rad,
+        "curvature_1pm": _at_nodes(fit.strain[:, 1:]),
+        "sigma_curvature_1pm": _at_nodes(fit.sigma_strain[:, 1:]),
+        "stiffness_change": fit.stiffness_change,
+        "sigma_stiffness": fit.sigma_stiffness,
         "residual_m": fit.residual_m,
         "used": fit.used,
         "loads": fit.loads,
@@ -244,6 +256,12 @@ def _row(half: HalfWing, fit: Fit) -> dict[str, Any]:
         "outliers": int(fit.outlier.sum()),
         "reason": fit.reason,
     }
+
+
+def _at_nodes(of_elements: Floats) -> Floats:
+    """Values of N elements at the N + 1 nodes: the mean of a node's two."""
+    padded = np.concatenate([of_elements[:1], of_elements, of_elements[-1:]])
+    return np.asarray((padded[:-1] + padded[1:]) / 2)
 
 
 def _gather(
@@ -260,6 +278,9 @@ def _gather(
         timestamp_ns=series.frame_timestamp_ns,
         s_m=half.node_s_m,
         unloaded_xyz_m=half.rest_position_m,
+        reference=UNLOADED_WING,
+        reference_xyz_m=half.rest_position_m,
+        reference_twist_rad=np.zeros(half.node_s_m.size),
         markers=series,
         points=moved.points,
         load_s_m=load_s_m,

@@ -24,6 +24,7 @@ def summarise(fits: Mapping[str, SideFits]) -> dict[str, Any]:
         "start_utc": str(np.datetime64(int(times.min()), "ns")) + "Z",
         "duration_s": float((times.max() - times.min()) * 1e-9),
         "sides": [side.side for side in sides],
+        "reference": sides[0].reference,
         **_figures(sides),
         "by_side": {side.side: _figures([side]) for side in sides},
     }
@@ -45,9 +46,16 @@ def _figures(sides: list[SideFits]) -> dict[str, Any]:
         "markers_left_out_percent": float(100 * outlier.sum() / max(1, int(seen.sum()))),
         "residual_rms_mm": _rms(1e3 * residual[used & np.isfinite(residual)]),
         "chi2_per_dof": finite_or_none(chi2[fitted].sum() / dof[fitted].sum()) if fitted.any() else None,
+        "stiffness_change_percent": _stiffness(sides, "stiffness_change"),
+        "sigma_stiffness_percent": _stiffness(sides, "sigma_stiffness"),
         "sigma_tip_mm": _median(1e3 * tip),
         "sigma_tip_twist_deg": _median(twist),
     }
+
+
+def _stiffness(sides: list[SideFits], name: str) -> dict[str, float | None]:
+    percent = 100 * np.concatenate([getattr(side, name) for side in sides])
+    return {key: _median(percent[:, at]) for at, key in enumerate(("EA", "GJ", "EI_out", "EI_in"))}
 
 
 def _rms(values: Floats) -> float | None:
@@ -65,6 +73,7 @@ def verdict(summary: Mapping[str, Any]) -> list[str]:
     left_out, ratio = summary["markers_left_out_percent"], summary["chi2_per_dof"]
     grave = fitted < 90 or seen < 50
     doubtful = grave or fitted < 99.5 or seen < 90 or left_out > 2 or ratio is None or not 0.3 < ratio < 3
+    doubtful = doubtful or bool(summary.get("warnings"))
     lines = ["Poor." if grave else "Usable with care." if doubtful else "Good."]
     lines.append(
         "Every set was fitted."
@@ -77,6 +86,7 @@ def verdict(summary: Mapping[str, Any]) -> list[str]:
         lines.append(f"{left_out:.1f} % of them did not fit the wing and were left out: reflections or mix-ups?")
     if ratio is not None:
         lines.append(_agreement(ratio))
+    lines += summary.get("warnings", [])
     if summary["triggers_missing"]:
         lines.append(f"{summary['triggers_missing']} triggers between the first and the last have no set at all.")
     return lines

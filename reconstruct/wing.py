@@ -21,7 +21,16 @@ from reconstruct.beam import Beam
 from reconstruct.rotation import Array, Index, about_axis, cross
 from reconstruct.wing_file import FitSettings, SegmentSection, WingFile, first_error
 
-__all__ = ["FitSettings", "HalfWing", "Wing", "example_path", "read_wing", "twist_gradient", "twist_rad"]
+__all__ = [
+    "FitSettings",
+    "HalfWing",
+    "Wing",
+    "example_path",
+    "read_wing",
+    "read_wing_file",
+    "twist_gradient",
+    "twist_rad",
+]
 
 Side = Literal["left", "right"]
 _R_SIDE = {
@@ -57,6 +66,13 @@ class HalfWing:
     def rest_position_m(self) -> Array:
         """(N + 1, 3) nodes of the unloaded wing, body frame."""
         return self.beam.rest.position_m
+
+    @cached_property
+    def rest_marker_m(self) -> Array:
+        """(M, 3) markers of the unloaded wing, body frame."""
+        node, rest = self.marker_node, self.beam.rest
+        points: Array = rest.position_m[node] + (rest.R_body_section[node] @ self.marker_offset_m[:, :, None])[:, :, 0]
+        return points
 
     @cached_property
     def rest_incidence_rad(self) -> Array:
@@ -101,10 +117,21 @@ def read_wing(path: Path, nodes_at_m: tuple[float, ...] = ()) -> Wing:
         UsageError: the file cannot be read, has an unknown or missing key, or describes what cannot be (stiffness that
             is not positive definite, a marker off the wing); one line with file, key and reason.
     """
+    described = read_wing_file(path)
+    for station in nodes_at_m:
+        if not 0 <= station <= described.semispan_m + _SAME_STATION_M:
+            raise UsageError(
+                f"{path}: station {station} m is off the wing (its half span is {described.semispan_m:g} m)"
+            )
+    return build_wing(described, nodes_at_m)
+
+
+def read_wing_file(path: Path) -> WingFile:
+    """What a wing file says, checked. Raises UsageError as ``read_wing``."""
     try:
         with Path(path).open("rb") as file:
             content = tomllib.load(file)
-        described = WingFile.model_validate(content)
+        return WingFile.model_validate(content)
     except OSError as error:
         raise UsageError(
             f"{path}: {error.strerror or error}; give a wing file (see docs/reference/wing-file.md)"
@@ -113,12 +140,6 @@ def read_wing(path: Path, nodes_at_m: tuple[float, ...] = ()) -> Wing:
         raise UsageError(f"{path}: not TOML: {error}") from error
     except ValidationError as error:
         raise UsageError(f"{path}: {first_error(error)}") from error
-    for station in nodes_at_m:
-        if not 0 <= station <= described.semispan_m + _SAME_STATION_M:
-            raise UsageError(
-                f"{path}: station {station} m is off the wing (its half span is {described.semispan_m:g} m)"
-            )
-    return build_wing(described, nodes_at_m)
 
 
 def build_wing(described: WingFile, nodes_at_m: tuple[float, ...] = ()) -> Wing:

@@ -6,10 +6,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet
 import pytest
 
 from capture.errors import UsageError
 from reconstruct.instants import InstantSettings, at_common_instant
+from reconstruct.reference import parse_window, refer
+from reconstruct.result_tables import frames_table, result_tables
 from reconstruct.series import BLOCK_SETS, fit_series
 from reconstruct.tables import marker_series
 from reconstruct.wing import read_wing
@@ -180,3 +183,41 @@ class TestTables:
         shuffled = noisy.take(np.random.default_rng(0).permutation(noisy.num_rows))
         for side, series in marker_series(noisy, "made").items():
             assert np.array_equal(series.xyz_m, marker_series(shuffled, "made")[side].xyz_m, equal_nan=True)
+
+
+@pytest.fixture(scope="module")
+def still(bending_wing: Any, wing_file: Path) -> Any:
+    """At rest, bent by 0.2 rad and twisted by 1°, for a second; then 0.1 rad more."""
+    wing = bending_wing(bend_rad=lambda t: np.where(t < 0.99, 0.2, 0.3), twist_rad=lambda t: np.radians(1.0) + 0 * t)
+    table = wing.marker_table(np.arange(50) * 0.04, row_offset_s=0.0)
+    return wing, fit_series(marker_series(table, "made"), read_wing(wing_file), workers=1)
+
+
+class TestReference:
+    """Displacements are counted from what the user says, and say so."""
+
+    def test_a_window_at_rest(self, still: Any) -> None:
+        wing, fits = still
+        referred = refer(fits, parse_window("0:0.9"))
+        tip = frames_table(referred["right"])
+        assert referred["right"].reference == "mean of 0 to 0.9 s"
+        assert np.abs(tip.column("tip_dz_m").to_numpy()[:20]).max() < 1e-4
+        assert np.abs(tip.column("tip_twist_deg").to_numpy()).max() < 0.05
+        bent, _ = truth(wing, "right", np.array([3.0]), np.array([0.0, 1.9]))
+        assert tip.column("tip_dz_m").to_numpy()[-3] == pytest.approx(bent[1, 0, 2] - bent[0, 0, 2], abs=1e-3)
+
+    def test_another_result(self, still: Any, tmp_path: Path) -> None:
+        _, fits = still
+        pyarrow.parquet.write_table(result_tables(fits)["shape.parquet"], tmp_path / "shape.parquet")
+        referred = refer(fits, tmp_path)
+        assert referred["left"].reference == f"mean of {tmp_path / 'shape.parquet'}"
+        assert referred["left"].reference_xyz_m == pytest.approx(fits["left"].xyz_m.mean(axis=0))
+
+    @pytest.mark.parametrize("text", ["5", "a:b", "3:1", "-1:2", "0:nan"])
+    def test_no_window(self, text: str) -> None:
+        with pytest.raises(UsageError, match="--reference-window"):
+            parse_window(text)
+
+    def test_a_window_without_sets(self, still: Any) -> None:
+        with pytest.raises(UsageError, match=r"no set of the (left|right) wing was fitted in it"):
+            refer(still[1], parse_window("10:12"))
