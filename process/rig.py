@@ -28,6 +28,7 @@ ENOUGH = 0.75  # of the best score: no need to look for a better hypothesis
 ASSIGN_PX = 60.0  # far enough for a light with a wrong coordinate to be named as such
 CHI2_LIMIT = 25.0  # of a light's 4 degrees of freedom: one good light in 20 000 is beyond
 MAX_ROTATION_SIGMA_DEG = 0.5
+WARNED_MISFIT, REFUSED_MISFIT = 2.0, 4.0  # times the sigmas; good pairs have 0.5 to 1.1, exchanged ones 8 to 35
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +82,8 @@ def solve_pose(
     """Pose of ``pair`` from lights at ``surveyed_m`` (N, 3) ± ``sigma_m`` (N,), seen as spots in both cameras.
 
     ``T_approx`` (4, 4) may be wrong by 8 deg and 0.1 m. Which spot is which light is found, not given; lights that are
-    not seen or do not fit are left out with a reason. Raises ProcessError with fewer than four good lights, or if
-    they do not determine the pose.
+    not seen or do not fit are left out with a reason. Raises ProcessError with fewer than four good lights, if they do
+    not determine the pose, or if they fit far worse than their sigmas say: the calibration is not of these cameras.
     """
     assigned = _assign(pair, T_approx, surveyed_m, spots0, spots1)
     seen = np.all(assigned >= 0, axis=1)
@@ -96,7 +97,8 @@ def solve_pose(
         if used.sum() < MIN_POINTS:
             detail = "; ".join(f"{name}: {reason}" for name, reason in zip(names, reasons, strict=True) if reason)
             raise ProcessError(
-                f"{int(used.sum())} of {len(names)} surveyed lights can be used, {MIN_POINTS} are needed ({detail})"
+                f"{int(used.sum())} of {len(names)} surveyed lights can be used, {MIN_POINTS} are needed ({detail}); "
+                "is the survey right, and is this not the other side's pair file?"
             )
         problem = _Problem(pair, surveyed_m[used], sigma_m[used], *_measured(assigned[used], spots0, spots1))
         T, chi2, covariance, residuals = problem.solve()
@@ -128,13 +130,17 @@ def _fit(
             f"the surveyed lights leave the pair's attitude uncertain by {rotation_sigma_deg:.1f} deg: "
             "they are nearly in a line; survey lights that are well apart in all directions"
         )
-    warnings = []
-    if ratio > 4.0:
-        warnings.append(
-            f"the lights fit {np.sqrt(ratio):.1f} times worse than their sigmas say: the survey or the calibration is "
-            "worse than stated"
-        )
     errors = in_cam0 @ T[:3, :3].T + T[:3, 3] - surveyed_m
+    misfit = f"the lights fit {np.sqrt(ratio):.1f} times worse than their sigmas say"
+    if ratio > REFUSED_MISFIT**2:
+        rms_mm = 1000.0 * np.sqrt(np.mean(np.sum(errors[used] ** 2, axis=1)))
+        raise ProcessError(
+            f"{misfit} ({rms_mm:.1f} mm RMS): is this the other side's pair file, or one of other cameras? Else the "
+            "survey is wrong, or a lens was touched after the calibration: calibrate the pair again"
+        )
+    warnings = []
+    if ratio > WARNED_MISFIT**2:
+        warnings.append(f"{misfit}: the survey or the calibration is worse than stated")
     pixels = np.full((len(names), 2, 2), np.nan)
     pixels[used] = residuals
     points = [

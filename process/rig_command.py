@@ -30,7 +30,12 @@ def rig(
     surveyed = read_survey(survey)
     if not output.resolve().parent.is_dir():
         raise ProcessError(f"{output.parent}: no such folder to write to; make it first")
-    fits = {side: locate(pairs[side], getattr(surveyed, side)) for side in pairs}
+    fits = {}
+    for side, file in (("left", left), ("right", right)):
+        try:
+            fits[side] = locate(pairs[side], getattr(surveyed, side))
+        except ProcessError as error:
+            raise ProcessError(f"{side} side with {file}: {error}; {output} is not written") from error
     inputs = [left, right, survey, *(path for side in pairs for path in _images(getattr(surveyed, side)))]
     made = provenance(shlex.join(["wingproc", *sys.argv[1:]]), inputs)
     summary = {side: summarise(fit) for side, fit in fits.items()}

@@ -225,6 +225,23 @@ def test_a_wrong_survey_is_refused_by_file_and_key(survey_folder, old, new, mess
     assert str(path) in str(caught.value)
 
 
+def test_the_other_sides_pair_file_is_refused(survey_folder):
+    """A pair that is alike but not the same: focal length half a percent, principal point 8 px, pose 0.2 deg away."""
+    other = CameraModel(2080, 1552, CAMERA.K + np.array([[7.0, 0, 8.0], [0, 7.0, 1.0], [0, 0, 0]]), CAMERA.distortion)
+    turned = PAIR.T_cam1_cam0 @ pose_matrix([0.0005, 0.003, -0.0005], [0.002, 0.0003, -0.0003])
+    write_pair(
+        survey_folder / "pair.json",
+        StereoPair(CAMERA, other, turned),
+        camera_rms_px=(0.1, 0.1),
+        stereo_rms_px=0.1,
+        provenance={},
+    )
+    causes = r"times worse than their sigmas.*other side's pair.*survey.*lens was touched"
+    with pytest.raises(ProcessError, match=causes):
+        command(survey_folder)
+    assert not (survey_folder / "rig.json").exists()
+
+
 def test_missing_files_are_named(survey_folder):
     (survey_folder / "right1.png").unlink()
     with pytest.raises(ProcessError, match=r"right1\.png"):
@@ -245,5 +262,5 @@ def test_pictures_of_another_size_are_refused(survey_folder):
 
 def test_a_dark_picture_is_refused_with_its_name(survey_folder):
     cv2.imwrite(str(survey_folder / "left0.png"), np.zeros((1552, 2080), np.uint8))
-    with pytest.raises(ProcessError, match=r"left0\.png.*0 of 8 surveyed lights"):
+    with pytest.raises(ProcessError, match=r"left0\.png.*0 of 8 surveyed lights.*other side's pair"):
         command(survey_folder)
