@@ -226,9 +226,9 @@ def test_a_wrong_survey_is_refused_by_file_and_key(survey_folder, old, new, mess
 
 
 def test_the_other_sides_pair_file_is_refused(survey_folder):
-    """A pair that is alike but not the same: focal length half a percent, principal point 8 px, pose 0.2 deg away."""
-    other = CameraModel(2080, 1552, CAMERA.K + np.array([[7.0, 0, 8.0], [0, 7.0, 1.0], [0, 0, 0]]), CAMERA.distortion)
-    turned = PAIR.T_cam1_cam0 @ pose_matrix([0.0005, 0.003, -0.0005], [0.002, 0.0003, -0.0003])
+    """A pair that is alike but not the same: focal length 1 px, principal point 8 px, pose 0.2 deg away."""
+    other = CameraModel(2080, 1552, CAMERA.K + np.array([[1.0, 0, 8.0], [0, 1.0, 0.5], [0, 0, 0]]), CAMERA.distortion)
+    turned = PAIR.T_cam1_cam0 @ pose_matrix([0.0002, -0.004, -0.0005], [0.002, 0.0003, -0.0003])
     write_pair(
         survey_folder / "pair.json",
         StereoPair(CAMERA, other, turned),
