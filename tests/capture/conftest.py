@@ -225,8 +225,8 @@ def _pixels_of() -> Callable[[str, int], np.ndarray]:
 def wingcap() -> Callable[..., subprocess.CompletedProcess[str]]:
     """Runs the command as a user would."""
 
-    def call(*words: object) -> subprocess.CompletedProcess[str]:
+    def call(*words: object, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-c", "from capture.cli import main; main()", *map(str, words)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=60)
+        return subprocess.run(command, capture_output=True, text=True, timeout=timeout)
 
     return call

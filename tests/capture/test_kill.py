@@ -1,6 +1,7 @@
 """``kill -9`` at random moments of a real recording: every frame that was complete on the disk comes back."""
 
 import itertools
+import json
 import os
 import random
 import signal
@@ -60,6 +61,30 @@ def whole_images(folder: Path) -> int:
             except (McapError, CRCValidationError, ValueError, OSError):
                 continue
     return count
+
+
+@pytest.mark.slow
+def test_sigterm_loses_nothing(hardware):
+    draw = random.Random(SEED + 1)
+    for number in range(3):
+        config = hardware.with_name(f"term_{number}.toml")
+        config.write_text(f'flight = "term_{number}"\n' + hardware.read_text())
+        command = [sys.executable, "-c", RECORD, "record", "--config", config, "--json"]
+        recorder = subprocess.Popen(
+            command, cwd=hardware.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        for line in recorder.stderr:
+            if line.startswith("triggers"):
+                break
+        time.sleep(draw.uniform(0.0, 1.0))
+        recorder.send_signal(signal.SIGTERM)
+        output, errors = recorder.communicate(timeout=30)
+        assert recorder.returncode == 0, errors
+        result = json.loads(output)
+        report = inspect([hardware.parent / f"ssd_{side}/term_{number}" for side in ("left", "right")])
+        assert report.problems == []
+        assert report.recorded == result["frames_recorded"] == 4 * report.triggers > 0
+        assert report.lost == result["frames_lost"] == 0
 
 
 @pytest.mark.slow
