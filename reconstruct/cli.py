@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 
 from capture.console import note, run, say, say_json
 from capture.errors import UsageError
+from reconstruct.import_wing import import_wing
 from reconstruct.plan import plan
 from reconstruct.reference import parse_window
 from reconstruct.report import write_report
@@ -138,6 +139,7 @@ def report_command(
 
 app.command("static")(static)
 app.command("plan")(plan)
+app.command("import")(import_wing)
 
 
 @app.command("example")

@@ -67,7 +67,7 @@ def pixel_problem(
         ahead = np.isfinite(image).all(axis=2) & np.isfinite(slope).all(axis=(2, 3)) & seen
         error = np.where(ahead[:, :, None], image - given, 0.0).reshape(markers, 4)
         slopes = np.where(ahead[:, :, None, None], slope, 0.0).reshape(markers, 4, 3)
-        spread: Array = settings.marker_model_sigma_m**2 * slopes @ slopes.transpose(0, 2, 1)
+        spread = settings.marker_model_sigma_m**2 * slopes @ slopes.transpose(0, 2, 1)
         for at in range(_CAMERAS):
             spread[:, 2 * at : 2 * at + 2, 2 * at : 2 * at + 2] += safe[:, at]
         whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(spread)), dtype=np.float64)
@@ -79,5 +79,5 @@ def pixel_problem(
 
 def _cameras_from_body(rig: RigSide) -> tuple[Array, Array]:
     """Poses (4, 4) that take body coordinates into each camera's."""
-    T_cam0_body: Array = np.linalg.inv(rig.T_body_cam0)
+    T_cam0_body = np.asarray(np.linalg.inv(rig.T_body_cam0), dtype=np.float64)
     return T_cam0_body, rig.pair.T_cam1_cam0 @ T_cam0_body
