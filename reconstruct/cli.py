@@ -57,6 +57,10 @@ def run_command(
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="rig.json of this flight's cameras; needed for frames.")] = None,
     markers: Annotated[Path | None, typer.Option(help="Start from this marker table instead of frames.")] = None,
+    smooth: Annotated[
+        float,
+        typer.Option(min=0.0, help="Smooth in time, and bridge gaps: seconds over which motion is alike; 0: off."),
+    ] = 0.0,
     reference: Annotated[
         Path | None,
         typer.Option(help="Count displacements from this result, at rest, instead of the unloaded wing."),
@@ -76,7 +80,7 @@ def run_command(
     if reference is not None and reference_window is not None:
         raise UsageError("give --reference or --reference-window, not both")
     at_rest = parse_window(reference_window) if reference_window is not None else reference
-    job = Job(tuple(flights), rig, table, wing, out, csv, workers, _command(), at_rest)
+    job = Job(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest)
     with _progress() as progress:
         summary, warnings = run_job(job, progress)
     if json:

@@ -13,6 +13,7 @@ from reconstruct.iteration import (
     Problem,
     State,
     iterate,
+    linearise,
     objection,
     stiffness_forces,
     unit_forces,
@@ -92,10 +93,36 @@ def fit_frame(
     """
     posed = marker_problem(half, marker_xyz_m, marker_cov_m2, settings)
     fit = fit_measured(posed, settings, start, prior_scale)
+    return with_residuals(half, fit, marker_xyz_m)
+
+
+def with_residuals(half: HalfWing, fit: Fit, marker_xyz_m: Array) -> Fit:
+    """The fit with measured minus fitted places of the markers that were measured."""
     if not fit.converged:
         return fit
-    placed = marker_places(half, fit)
-    return replace(fit, residual_m=np.where(posed.problem.seen[:, None], marker_xyz_m - placed, np.nan))
+    measured = (fit.used | fit.outlier)[:, None]
+    return replace(fit, residual_m=np.where(measured, marker_xyz_m - marker_places(half, fit), np.nan))
+
+
+def fit_from(
+    posed: Unscaled, settings: FitSettings, single: Fit, theta: Array, covariance: Array, prior_scale: Array
+) -> Fit:
+    """The fit at unknowns (u,) with covariance (u, u) that were found elsewhere, from more than this set's markers.
+
+    ``single`` is the set's own fit, whose verdict on the markers stays; where there was none, no marker is in use.
+    Loads must act everywhere.
+    """
+    problem = scaled(posed, prior_scale)
+    assert problem.modes is not None
+    linear = linearise(problem, (problem.modes @ theta).reshape(-1, 4), theta)
+    A = linear.jacobian[single.used].reshape(-1, len(theta))
+    factor = np.asarray(np.linalg.cholesky(covariance + 1e-12 * np.eye(len(theta))).T, dtype=np.float64)
+    weight = single.used.astype(np.float64)
+    state = State(True, single.iterations, theta, linear, weight, factor, A.T @ A, "")
+    found = _result(problem, state, np.array(settings.load_stations_m), prior_scale)
+    if single.converged:
+        return found
+    return replace(found, outlier=single.outlier, distance=single.distance, chi2=float("nan"), dof=float("nan"))
 
 
 def marker_problem(half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, settings: FitSettings) -> Unscaled:
@@ -213,7 +240,7 @@ def fit_measured(
             against = objection(problem, state)
         if against:
             return _failed(problem.half, stations, state.iterations, against)
-    return _result(_scaled(posed, scale), state, stations, scale)
+    return _result(scaled(posed, scale), state, stations, scale)
 
 
 def _from_loads_everywhere(posed: Unscaled, settings: FitSettings) -> tuple[Array, Array]:
@@ -238,7 +265,7 @@ def _solve(
     theta = theta * np.sqrt(begin[group] / scale[group])
     iterations = 0
     for _ in range(_SCALE_ROUNDS):
-        state = iterate(_scaled(posed, scale), strain, theta)
+        state = iterate(scaled(posed, scale), strain, theta)
         iterations += state.iterations
         if fixed is not None or objection(posed.problem, state):
             break
@@ -262,7 +289,8 @@ def _told(state: State) -> Array:
     return told
 
 
-def _scaled(posed: Unscaled, scale: Array) -> Problem:
+def scaled(posed: Unscaled, scale: Array) -> Problem:
+    """The problem with its prior's groups as large as ``scale`` (4,) says."""
     root = np.sqrt(scale[posed.group])
     problem = posed.problem
     if problem.modes is not None:

@@ -44,6 +44,7 @@ class Job:
     csv: bool
     workers: int | None  # None: one a core
     command: str  # as it is recorded in the files
+    smooth_s: float = 0.0  # correlation time of smoothing; 0: every set by itself
     reference: Reference = None  # what displacements are counted from; None: the unloaded wing
 
 
@@ -65,7 +66,7 @@ def run_job(job: Job, progress: Progress) -> tuple[dict[str, Any], tuple[str, ..
         done += count
         progress("fit", done, total)
 
-    fits = refer(fit_series(series, wing, workers=job.workers, progress=fitted), job.reference)
+    fits = refer(fit_series(series, wing, smooth_s=job.smooth_s, workers=job.workers, progress=fitted), job.reference)
     fit_end = time.monotonic()
     _write_tables(job, table, fits, inputs)
     written = time.monotonic()

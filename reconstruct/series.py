@@ -14,6 +14,7 @@ import numpy as np
 from capture.errors import ReconstructError, UsageError
 from reconstruct.fit import Fit, common_scale, fit_frame
 from reconstruct.instants import InstantMarkers, InstantSettings, at_common_instant
+from reconstruct.smooth import smooth_fits
 from reconstruct.tables import Bools, Floats, Ints, MarkerSeries, Words
 from reconstruct.wing import HalfWing, Wing
 from reconstruct.wing_file import FitSettings
@@ -57,8 +58,9 @@ class SideFits:
     chi2: Floats  # (F,)
     dof: Floats  # (F,)
     iterations: Ints  # (F,)
-    flags: Words  # (F,) str, empty when good: not_fitted, outlier (markers left out), row_time (taken as they are)
+    flags: Words  # (F,) str, empty when good: not_fitted, outlier (markers left out), row_time, bridged
     reason: Words  # (F,) str, why a set could not be fitted
+    smoothed_s: float  # correlation time of the smoothing; 0: every set by itself
 
     @property
     def converged(self) -> Bools:
@@ -80,6 +82,7 @@ def fit_series(
     wing: Wing,
     *,
     instants: InstantSettings | None = None,
+    smooth_s: float = 0.0,
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> dict[str, SideFits]:
@@ -87,7 +90,8 @@ def fit_series(
 
     Markers are first brought to their set's common instant. Sets are fitted in blocks of BLOCK_SETS, each from the
     last one's fit; blocks start from the unloaded wing, so the result does not depend on ``workers`` (default: one a
-    core this process may use). A set that cannot be fitted is NaN and flagged.
+    core this process may use). A set that cannot be fitted is NaN and flagged. With ``smooth_s`` the sets of a side are
+    smoothed in time over so many seconds instead, one after the other, and sets that could not be fitted are bridged.
     Raises UsageError when the markers are not those of ``wing`` or none was measured, ReconstructError when a worker
     process dies.
     """
@@ -99,6 +103,8 @@ def fit_series(
         measured[side] = (series, at_common_instant(series, instants))
     if not any(moved.points.any() for _, moved in measured.values()):
         raise UsageError("no marker was measured in any set; look at the flags column of the marker table")
+    if smooth_s > 0:
+        return {side: _smoothed(wing, *both, smooth_s, progress) for side, both in measured.items()}
     blocks = [block for side, (_, moved) in measured.items() for block in _blocks(wing, side, moved)]
     done: dict[str, dict[int, _Rows]] = {side: {} for side in measured}
     for block, rows in _fit_blocks(blocks, wing, workers or len(os.sched_getaffinity(0))):
@@ -158,6 +164,22 @@ def _blocks(wing: Wing, side: str, moved: InstantMarkers) -> list[_Block]:
         _Block(side, first, moved.xyz_m[first : first + BLOCK_SETS], moved.cov_m2[first : first + BLOCK_SETS], scale)
         for first in range(0, sets, BLOCK_SETS)
     ]
+
+
+def _smoothed(
+    wing: Wing, series: MarkerSeries, moved: InstantMarkers, smooth_s: float, progress: Callable[[int], None] | None
+) -> SideFits:
+    half, settings = _half(wing, series.side), _settings(wing)
+    if settings.loads != "everywhere":
+        raise UsageError('smoothing in time needs loads = "everywhere" in the wing file\'s [fit]')
+    time_s = (series.frame_timestamp_ns - series.frame_timestamp_ns[0]) * 1e-9
+    if np.any(np.diff(time_s) <= 0):
+        raise UsageError(f"{series.side} wing: times of the sets do not grow; smoothing in time needs that they do")
+    scale = common_scale(half, moved.xyz_m, moved.cov_m2, settings)
+    fits = smooth_fits(half, settings, moved.xyz_m, moved.cov_m2, time_s, scale, smooth_s, progress or (lambda _: None))
+    rows = [_row(half, fit) for fit in fits]
+    block = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return _gather(half, series, moved, np.array(settings.load_stations_m), [block], smooth_s)
 
 
 def _fit_blocks(blocks: list[_Block], wing: Wing, workers: int) -> Iterator[tuple[_Block, _Rows]]:
@@ -265,13 +287,19 @@ def _at_nodes(of_elements: Floats) -> Floats:
 
 
 def _gather(
-    half: HalfWing, series: MarkerSeries, moved: InstantMarkers, load_s_m: Floats, blocks: list[_Rows]
+    half: HalfWing,
+    series: MarkerSeries,
+    moved: InstantMarkers,
+    load_s_m: Floats,
+    blocks: list[_Rows],
+    smoothed_s: float = 0.0,
 ) -> SideFits:
     rows = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     outliers = rows.pop("outliers")
     reason = rows.pop("reason").astype(object)
     alone = (rows["used"] & (moved.points == 1)).any(axis=1)
-    flagged = {"not_fitted": reason != "", "outlier": outliers > 0, "row_time": alone}
+    bridged = (reason == "") & ~rows["used"].any(axis=1)
+    flagged = {"not_fitted": reason != "", "outlier": outliers > 0, "row_time": alone, "bridged": bridged}
     return SideFits(
         side=series.side,
         trigger_index=series.trigger_index,
@@ -292,6 +320,7 @@ def _gather(
             dtype=object,
         ),
         reason=reason,
+        smoothed_s=smoothed_s,
         **rows,
     )
 

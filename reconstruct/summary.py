@@ -25,6 +25,7 @@ def summarise(fits: Mapping[str, SideFits]) -> dict[str, Any]:
         "duration_s": float((times.max() - times.min()) * 1e-9),
         "sides": [side.side for side in sides],
         "reference": sides[0].reference,
+        "smoothed_s": sides[0].smoothed_s,
         **_figures(sides),
         "by_side": {side.side: _figures([side]) for side in sides},
     }
@@ -45,7 +46,7 @@ def _figures(sides: list[SideFits]) -> dict[str, Any]:
         "markers_seen_percent": float(100 * seen.mean()),
         "markers_left_out_percent": float(100 * outlier.sum() / max(1, int(seen.sum()))),
         "residual_rms_mm": _rms(1e3 * residual[used & np.isfinite(residual)]),
-        "chi2_per_dof": finite_or_none(chi2[fitted].sum() / dof[fitted].sum()) if fitted.any() else None,
+        "chi2_per_dof": finite_or_none(np.nansum(chi2[fitted]) / np.nansum(dof[fitted])) if fitted.any() else None,
         "stiffness_change_percent": _stiffness(sides, "stiffness_change"),
         "sigma_stiffness_percent": _stiffness(sides, "sigma_stiffness"),
         "sigma_tip_mm": _median(1e3 * tip),

@@ -221,3 +221,45 @@ class TestReference:
     def test_a_window_without_sets(self, still: Any) -> None:
         with pytest.raises(UsageError, match=r"no set of the (left|right) wing was fitted in it"):
             refer(still[1], parse_window("10:12"))
+
+
+class TestSmoothing:
+    """Kalman and RTS on the unknowns: what neighbours tell, gaps bridged and marked, bands honest."""
+
+    @pytest.fixture
+    def gappy(self, bending_wing: Any, wing_file: Path) -> Any:
+        """Three seconds with 3 mm noise; six sets see one marker, and half a second at the end sees none."""
+        times = np.arange(75) * 0.04
+        wing = bending_wing()
+        table = wing.marker_table(times, sigma_m=3e-3, row_offset_s=0.0)
+        trigger, marker = (table.column(name).to_numpy() for name in ("trigger_index", "marker"))
+        number = trigger - trigger.min()
+        keep = ~((number >= 30) & (number < 36) & (marker > 0)) & ~((number >= 62) & (marker > 0))
+        series = marker_series(table.filter(pa.array(keep)), "made")
+        return wing, times, {side: series[side] for side in ("right",)}, read_wing(wing_file)
+
+    def test_better_than_each_set_by_itself(self, gappy: Any) -> None:
+        wing, times, series, described = gappy
+        single = fit_series(series, described, workers=1)["right"]
+        smooth = fit_series(series, described, smooth_s=0.3, workers=1)["right"]
+        axis, twist = truth(wing, "right", single.s_m, times)
+        good = single.converged
+        errors = [np.linalg.norm(fits.xyz_m - axis, axis=-1)[good] for fits in (single, smooth)]
+        assert np.sqrt(np.mean(errors[1] ** 2)) < 0.8 * np.sqrt(np.mean(errors[0] ** 2))
+        turned = [np.sqrt(np.mean((fits.twist_rad - twist)[good] ** 2)) for fits in (single, smooth)]
+        assert turned[1] < 0.8 * turned[0]
+        ratio = (smooth.xyz_m - axis)[good][:, 5:, 2] / smooth.sigma_xyz_m[good][:, 5:, 2]
+        assert 0.4 < np.mean(ratio**2) < 1.5
+
+    def test_gaps_are_bridged_and_marked(self, gappy: Any) -> None:
+        wing, times, series, described = gappy
+        smooth = fit_series(series, described, smooth_s=0.3, workers=1)["right"]
+        axis, _ = truth(wing, "right", smooth.s_m, times)
+        bridged = np.array(["bridged" in flags for flags in smooth.flags])
+        assert np.flatnonzero(bridged).tolist() == list(range(30, 36))
+        error = np.abs(smooth.xyz_m - axis)[bridged][:, -1, 2]
+        assert np.all(error < 3 * smooth.sigma_xyz_m[bridged][:, -1, 2])
+        assert smooth.sigma_xyz_m[33, -1, 2] > 2 * smooth.sigma_xyz_m[20, -1, 2]
+        assert np.isnan(smooth.xyz_m[62:]).all()  # nothing after it: extrapolation is not a bridge
+        assert all(flags == "not_fitted" for flags in smooth.flags[62:])
+        assert smooth.reason[70] == "1 of 18 markers measured, 3 needed"

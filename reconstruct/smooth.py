@@ -1,0 +1,132 @@
+"""Markers of consecutive sets into fits that know of each other: a Kalman filter and smoother on the fit's unknowns.
+
+Each unknown is a Matérn 3/2 process in time of the prior's variance (twice integrable noise: wings do not jump). Sets
+without enough markers are bridged, with bands as wide as the neighbours allow. Equation numbers are those of
+docs/explanation/beam.md.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from reconstruct.fit import Fit, Unscaled, fit_frame, fit_from, marker_problem, scaled, with_residuals
+from reconstruct.iteration import linearise
+from reconstruct.rotation import Array, Mask
+from reconstruct.wing import HalfWing
+from reconstruct.wing_file import FitSettings
+
+_TOLD = 1e-3  # an unknown's direction of which no set tells more is left to the prior
+_FARTHEST = 3.0  # correlation times: what lies farther from the next fitted set is not bridged
+
+
+def smooth_fits(
+    half: HalfWing,
+    settings: FitSettings,
+    marker_xyz_m: Array,
+    marker_cov_m2: Array,
+    time_s: Array,
+    prior_scale: Array,
+    correlation_s: float,
+    progress: Callable[[int], None] = lambda _: None,
+) -> list[Fit]:
+    """Fit F sets by themselves, then smooth what they tell (Rauch, Tung & Striebel 1965; eqs. 28 and 29).
+
+    Args:
+        half: the half wing.
+        settings: from the wing file; loads must act everywhere.
+        marker_xyz_m: (F, M, 3) at the sets' common instants, NaN where not measured.
+        marker_cov_m2: (F, M, 3, 3).
+        time_s: (F,) ascending.
+        prior_scale: (4,) one for all.
+        correlation_s: over which the wing's motion is alike.
+        progress: told the number of sets fitted since last.
+
+    Returns:
+        F fits. One whose set could not be fitted has no marker in use; it is not bridged, but NaN with its own reason,
+        where no fitted set lies within three correlation times on both sides.
+    """
+    if settings.loads != "everywhere":
+        raise ValueError('smoothing needs loads = "everywhere"')
+    single, posed = [], []
+    before: Fit | None = None
+    for xyz, cov in zip(marker_xyz_m, marker_cov_m2, strict=True):
+        before = fit_frame(half, xyz, cov, settings, start=before, prior_scale=prior_scale)
+        single.append(before)
+        posed.append(marker_problem(half, xyz, cov, settings))
+        progress(1)
+    good: Mask = np.array([fit.converged for fit in single], dtype=bool)
+    if good.sum() < 2:
+        return single
+    told = [_told(one, fit, prior_scale) if fit.converged else None for one, fit in zip(posed, single, strict=True)]
+    average = np.mean([information for information, _ in filter(None, told)], axis=0)
+    size, direction = np.linalg.eigh(average)
+    kept = direction[:, size > _TOLD]
+    mean, spread = _rts(
+        time_s, [t and (kept.T @ t[0] @ kept, kept.T @ t[1]) for t in told], kept.shape[1], correlation_s
+    )
+    near = _reachable(time_s, good, _FARTHEST * correlation_s)
+    left = np.eye(len(kept)) - kept @ kept.T
+    out = []
+    for i, (one, fit) in enumerate(zip(posed, single, strict=True)):
+        if not near[i]:
+            out.append(fit)
+            continue
+        smoothed = fit_from(one, settings, fit, kept @ mean[i], kept @ spread[i] @ kept.T + left, prior_scale)
+        out.append(with_residuals(half, smoothed, marker_xyz_m[i]))
+    return out
+
+
+def _told(posed: Unscaled, fit: Fit, scale: Array) -> tuple[Array, Array]:
+    """A set's own information (u, u) and its product with the likeliest unknowns (u,), the prior taken out."""
+    linear = linearise(scaled(posed, scale), fit.strain, fit.unknowns)
+    A = linear.jacobian[fit.used].reshape(-1, len(fit.unknowns))
+    information = A.T @ A
+    return information, information @ fit.unknowns + fit.unknowns
+
+
+def _rts(
+    time_s: Array, told: list[tuple[Array, Array] | None], unknowns: int, correlation_s: float
+) -> tuple[Array, Array]:
+    """Smoothed means (F, r) and covariances (F, r, r) of r unknowns with unit variance, and their rates."""
+    rate = np.sqrt(3) / correlation_s
+    r = unknowns
+    still = np.kron(np.diag([1.0, rate**2]), np.eye(r))
+    mean, P = np.zeros(2 * r), still
+    predicted, filtered, moves = [], [], []
+    for i, known in enumerate(told):
+        if i > 0:
+            step = rate * (time_s[i] - time_s[i - 1])
+            pair = np.exp(-step) * np.array([[1 + step, step / rate], [-rate * step, 1 - step]])
+            move = np.kron(pair, np.eye(r))
+            mean = move @ mean
+            P = move @ (P - still) @ move.T + still
+            moves.append(move)
+        predicted.append((mean, P))
+        if known is not None:
+            information, product = known
+            gain = np.linalg.solve(np.eye(r) + information @ P[:r, :r], information)
+            P = P - P[:, :r] @ gain @ P[:r]
+            P = (P + P.T) / 2
+            mean = mean + P[:, :r] @ (product - information @ mean[:r])
+        filtered.append((mean, P))
+    means, spreads = np.empty((len(told), r)), np.empty((len(told), r, r))
+    for i in range(len(told) - 1, -1, -1):
+        if i < len(told) - 1:
+            ahead_mean, ahead_P = predicted[i + 1]
+            here_mean, here_P = filtered[i]
+            back = np.linalg.solve(ahead_P, moves[i] @ here_P).T
+            mean = here_mean + back @ (mean - ahead_mean)
+            P = here_P + back @ (P - ahead_P) @ back.T
+        means[i], spreads[i] = mean[:r], (P[:r, :r] + P[:r, :r].T) / 2
+    return means, spreads
+
+
+def _reachable(time_s: Array, good: Mask, reach_s: float) -> Mask:
+    """Which sets were fitted, or have fitted ones before and after them within reach."""
+    at = time_s[good]
+    after = np.searchsorted(at, time_s)
+    since = time_s - at[np.clip(after - 1, 0, None)]
+    until = at[np.clip(after, None, len(at) - 1)] - time_s
+    inside = (after > 0) & (after < len(at)) & (since <= reach_s) & (until <= reach_s)
+    reachable: Mask = np.logical_or(good, inside)
+    return reachable
