@@ -18,12 +18,12 @@ FREE, TWIST, OUT, IN = 0, 1, 2, 3
 GROUPS = 4
 STATED = np.ones(GROUPS)  # the scale of every group's variance as the wing file states it
 STATIONS_GROUP = np.array([OUT, OUT, OUT, TWIST, TWIST, TWIST])  # of force and moment components at a station
-_PULL = np.array([np.inf, 1.0, 8.0, 2.0])  # numbers' worth of belief in the stated scale, by group
-_LEAST = np.array([1.0, 0.15, 1.0, 0.05])  # scale: loads are rougher than any smooth few say, when these are small
+_PULL = np.array([np.inf, 2.0, 8.0, 2.0])  # numbers' worth of belief in the stated scale, by group
+_LEAST = np.array([1.0, 0.35, 1.0, 0.05])  # scale: loads are rougher than any smooth few say, when these are small
 _SMALLEST_MODE = 1e-5  # of the largest mode's variance
 _LOAD_REACH = {TWIST: 0.15, OUT: 1.0, IN: 4 / 3}  # correlation lengths of distributed loads, of the settings' one
 _AT_TIP = 0.15  # share of loads at the tip in the sigma,
-_ROUGH = {TWIST: 0.2, OUT: 0.1, IN: 0.05}  # and of what no smooth load explains
+_ROUGH = {TWIST: 0.3, OUT: 0.1, IN: 0.05}  # and of what no smooth load explains
 _ACCELERATION_G = ((2, 1.5), (0, 0.3))  # body axis, sigma: of the masses, weight included
 _G_M_S2 = 9.80665
 

@@ -132,7 +132,7 @@ class FitSettings(Strict):
 
     loads: Literal["everywhere", "stations"] = "everywhere"  # at every node, or only at the stations (the paper's way)
     load_stations_m: Annotated[tuple[Positive, ...], Field(min_length=1)]  # where loads act, or are reported
-    twist_sigma_deg: Positive = 3.0
+    twist_sigma_deg: Positive = 2.0
     bend_out_sigma_deg: Positive = 40.0
     bend_in_sigma_deg: Positive | None = None  # None: out of plane's, times √(EI_out / EI_in)
     extension_sigma: Positive = 5e-5
