@@ -31,6 +31,7 @@ class Detection(StrEnum):
     """Choices of ``--detection``."""
 
     default = "default"
+    fast = "fast"
     paper = "paper"
 
 
@@ -53,7 +54,7 @@ def markers(
     rig: Annotated[Path, typer.Option(help="rig.json of this flight's cameras.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The table to write (Parquet).")],
     detection: Annotated[
-        Detection, typer.Option(help="Fit a blurred disc to each spot, or the paper's contour centroids.")
+        Detection, typer.Option(help="Fit each spot, windowed centroids (fast), or the paper's contour centroids.")
     ] = Detection.default,
     matching: Annotated[
         Matching, typer.Option(help="Epipolar geometry and the wing's layout, or the paper's sorting by rows.")

@@ -1,51 +1,50 @@
-"""Patches of light spots to their centres and covariances: a blurred disc fitted with the sensor's noise as weights.
+"""Patches of light spots to their centres and covariances: a soft-edged ellipse fitted with the noise as weights.
 
-The profile is a slab of half width R blurred by a Gaussian of standard deviation s, taken along the radius ρ and
-scaled to 1 at the centre,
+The profile is a Fermi function of the elliptic distance squared, scaled to 1 at the centre,
 
-    f(ρ) = [erf((R + ρ) / √2 s) + erf((R − ρ) / √2 s)] / (2 erf(R / √2 s)),
+    f(t) = exp k / (exp k − 1 + exp t),        t = a Δu² + c Δv² + 2 d Δu Δv,
 
-which is a Gaussian for R → 0 and the blurred edge of a disc for R ≫ s. The radius is that of an ellipse,
-
-    ρ² = (1 + e) Δu² + (1 − e) Δv² + 2 h Δu Δv,
-
-since lights off the optical axis, and moving ones, are not round; a prior keeps e and h small where a spot is too
-small to tell. A spot is b + A f(ρ). Weights are the inverse variances of the sensor, σ_b² + g A f: background noise
-and shot noise (g grey levels an electron). All spots are fitted together, by Levenberg–Marquardt on stacked systems.
+which is a Gaussian for k = 0 and a disc with a soft edge at t = k for large k: it follows a blurred disc closely at the
+price of one exponential a pixel. A prior keeps the ellipse near a circle where a spot is too small to tell, and holds k
+where it is not determined. A spot is b + A f(t). Weights are the inverse variances of the
+sensor, σ_b² + g A f: background noise and shot noise (g grey levels an electron). All spots are fitted together, by
+Levenberg–Marquardt on their pixels laid end to end.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
 Array = NDArray[np.float64]
 
-U, V, AMPLITUDE, BACKGROUND, RADIUS, BLUR, STRETCH, SHEAR = range(8)
+U, V, AMPLITUDE, BACKGROUND, CURVE_UU, CURVE_VV, CURVE_UV, EDGE = range(8)
 PARAMETERS = 8
-_PRIOR = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 25.0, 25.0])  # 1/σ² about zero: σ = 0.2 for e and h
-ITERATIONS = 12
-REWEIGHTED_AT = 3
-CONVERGED_PX = 3e-3  # of the last step: what is left after it is a small part of it
+ITERATIONS = 14
+REWEIGHTED_AT = 2
+CONVERGED_PX = 4e-3  # of the last step: what is left after it is a small part of it
+SETTLED_CHI2 = 2.0  # and of χ²: a shape that still improves would pass for noise
 LEAST_CHI2 = 0.3  # a patch of a few pixels may fit by luck
+LEAST_EDGE, MOST_EDGE = -0.3, 40.0  # of k: a little more peaked than a Gaussian; a disc without blur
+USUAL_BLUR_PX = 0.9
+_LARGEST_T = 80.0  # exp(80) is far beyond every edge, and finite
+_SHAPE_WEIGHT = 25.0  # 1/σ² of the ellipse's (a − c)/(a + c) and 2d/(a + c) about zero: σ = 0.2
+_EDGE_WEIGHT = 1e-2  # 1/σ² of k about its start
 _EYE = np.eye(PARAMETERS)
-_ROOT_2 = np.sqrt(2.0)
-_ROOT_2PI = np.sqrt(2.0 * np.pi)
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """P pixels around each of N spots."""
+    """The pixels around each of N spots, laid end to end: K in all."""
 
     u_px: Array
-    """(N, P) columns"""
+    """(K,) columns"""
     v_px: Array
-    """(N, P) rows"""
+    """(K,) rows"""
     values: Array
-    """(N, P) grey levels"""
-    usable: NDArray[np.bool_]
-    """(N, P) False for pixels outside of the image, or another spot's"""
+    """(K,) grey levels"""
+    counts: NDArray[np.intp]
+    """(N,) pixels of each spot, none zero"""
     background_sigma: float
     """standard deviation of the background, grey levels"""
     shot_gain: float
@@ -53,146 +52,219 @@ class Patches:
     saturation: float
     """grey level from which a value only says "at least this much" """
 
+    def spread(self, per_spot: Array) -> Array:
+        """Values (..., N) of the spots to their pixels (..., K)."""
+        return np.repeat(per_spot, self.counts, axis=-1)
+
+    def sums(self, per_pixel: Array) -> Array:
+        """Sums (..., N) of values (..., K) over each spot."""
+        return np.asarray(np.add.reduceat(per_pixel, np.cumsum(self.counts) - self.counts, axis=-1))
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What was fitted to N patches."""
+    """What was fitted to N spots."""
 
     parameters: Array
-    """(N, 8) u, v, A, b, R, s, e, h"""
+    """(N, 8) u, v, A, b, a, c, d, k"""
     covariance_px2: Array
     """(N, 2, 2) of (u, v): inverse Fisher information times χ² a degree of freedom: that makes up for a wrong gain"""
     chi2_per_dof: Array
     converged: NDArray[np.bool_]
 
 
+@dataclass(eq=False)
+class _Evaluation:
+    """The model at some parameters."""
+
+    light: Array  # (K,) A f
+    jacobian: Array  # (9, K): by the parameters, and the residual
+    chi2: Array  # (N,)
+
+
 def spot_light(parameters: Array, u_px: Array, v_px: Array) -> Array:
-    """A f(ρ) (N, P) of spots (N, 8) at pixels (N, P)."""
-    u, v, amplitude, _, radius, blur, stretch, shear = (parameters[:, k, None] for k in range(PARAMETERS))
+    """A f(t) (N, P) of spots (N, 8) at pixels (P,)."""
+    u, v, amplitude, _, uu, vv, uv, edge = (parameters[:, k, None] for k in range(PARAMETERS))
     du, dv = u_px - u, v_px - v
-    rho = np.sqrt((1.0 + stretch) * du * du + (1.0 - stretch) * dv * dv + 2.0 * shear * du * dv)
-    scale = _ROOT_2 * blur
-    total = erf((radius + rho) / scale) + erf((radius - rho) / scale)
-    return np.asarray(amplitude * total / (2.0 * erf(radius / scale)))
+    t = np.minimum(uu * du * du + vv * dv * dv + 2.0 * uv * du * dv, _LARGEST_T)
+    return np.asarray(amplitude * np.exp(edge) / (np.expm1(edge) + np.exp(t)))
+
+
+def spot_size_px(parameters: Array) -> Array:
+    """(N,) radius of the evenly bright disc that has a spot's light and brightness."""
+    determinant = parameters[:, CURVE_UU] * parameters[:, CURVE_VV] - parameters[:, CURVE_UV] ** 2
+    return np.sqrt(_content(parameters[:, EDGE]) / np.sqrt(determinant))
+
+
+def _content(edge: Array) -> Array:
+    """∫ f dt = k / (1 − exp −k); 1 for a Gaussian."""
+    safe = np.where(np.abs(edge) < 1e-6, 1e-6, edge)
+    return np.asarray(safe / -np.expm1(-safe))
+
+
+def start_shape(patches: Patches, start: Array, area_px: Array) -> tuple[Array, Array]:
+    """Curvature a = c and edge k (N,) of round spots with the patches' light, blurred as lenses blur.
+
+    Discs of radius R under a Gaussian blur s are fitted best with k = R/s − 1.8, or by a Gaussian if that is negative.
+    """
+    amplitude, background = start[:, AMPLITUDE], start[:, BACKGROUND]
+    size2 = patches.sums(patches.values - patches.spread(background)) / (np.pi * amplitude)
+    size2 = np.clip(size2, 0.3 * area_px / np.pi, 2.0 * area_px / np.pi + 1.0)
+    edge = np.clip(np.sqrt(size2) / USUAL_BLUR_PX - 1.8, 0.1, 20.0)
+    return np.asarray(_content(edge) / size2), edge
 
 
 def fit_spots(patches: Patches, start: Array, others: Array | None = None) -> Fit:
-    """Fit every patch from ``start`` (N, 8).
+    """Fit every spot from ``start`` (N, 8).
 
-    ``others`` (N, P) is light of other spots in the patch, to be added to the model. Saturated pixels are censored:
-    they pull only while the model is below saturation. Spots that do not converge say so; nothing is raised.
+    ``others`` (K,) is light of other spots, to be added to the model. Saturated pixels are censored: they pull only
+    while the model is below saturation. Spots that do not converge say so; nothing is raised.
     """
-    parameters = start.copy()
     others = np.zeros(1) if others is None else others
-    kept = patches.usable
-    weights = _weights(patches, parameters, others, kept)
-    model, jacobian = _model(patches, parameters, others)
-    residual, chi2 = _residuals(patches, model, weights)
+    parameters = start.copy()
+    prior = _prior(start)
+    kept = np.ones(len(patches.values))
+    here = _evaluate(patches, parameters, others)
+    weights = _weights(patches, here.light, others, kept)
+    here.chi2 = _chi2(patches, here, weights)
     damping = np.full(len(start), 1e-3)
     moved = np.full(len(start), np.inf)
     for iteration in range(ITERATIONS):
         if iteration == REWEIGHTED_AT:  # by now the model is a better guess of the pixels' variance than the start was
-            kept = kept & ~_foreign_light(patches, parameters, others, residual)
-            weights = _weights(patches, parameters, others, kept)
-            residual, chi2 = _residuals(patches, model, weights)
-        information, gradient = _normal_equations(patches, model, jacobian, residual, weights)
-        information += np.diag(_PRIOR)
-        gradient -= parameters * _PRIOR
-        scaled = information + np.einsum("nii,ij,n->nij", information, _EYE, damping) + 1e-12 * _EYE
-        step = np.linalg.solve(scaled, gradient[:, :, None])[:, :, 0]
-        trial = _bounded(parameters + step, parameters, start)
-        trial_model, trial_jacobian = _model(patches, trial, others)
-        trial_residual, trial_chi2 = _residuals(patches, trial_model, weights)
-        rise = (trial**2 - parameters**2) @ _PRIOR
-        better = trial_chi2 + rise <= chi2 * (1.0 + 1e-9)
+            kept = _own_light(patches, parameters, here, others)
+            weights = _weights(patches, here.light, others, kept)
+            here.chi2 = _chi2(patches, here, weights)
+        information, gradient = _normal_equations(patches, here, weights)
+        information += prior
+        gradient -= (prior @ (parameters - start)[:, :, None])[:, :, 0]
+        ridge = (_diagonal(information) * damping[:, None] + 1e-12)[:, None, :] * _EYE
+        trial = _bounded(parameters + np.linalg.solve(information + ridge, gradient[:, :, None])[:, :, 0], parameters)
+        there = _evaluate(patches, trial, others)
+        there.chi2 = _chi2(patches, there, weights)
+        drop = here.chi2 + _pull(prior, parameters - start) - there.chi2 - _pull(prior, trial - start)
+        better = drop >= -1e-9 * here.chi2
         moved = np.where(better, np.abs(trial - parameters)[:, :2].max(axis=1), moved)
-        keep = better[:, None]
-        parameters = np.where(keep, trial, parameters)
-        model, residual = np.where(keep, trial_model, model), np.where(keep, trial_residual, residual)
-        jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
-        chi2 = np.where(better, trial_chi2, chi2)
-        damping = np.clip(np.where(better, damping * 0.2, damping * 20.0), 1e-6, 1e6)
-        if iteration > REWEIGHTED_AT and np.all(moved < CONVERGED_PX):
+        settled = (moved < CONVERGED_PX) & (np.abs(drop) < SETTLED_CHI2)
+        if better.all():
+            parameters, here = trial, there
+        else:
+            parameters = np.where(better[:, None], trial, parameters)
+            here = _chosen(patches, better, there, here)
+        damping = np.clip(np.where(better, damping * 0.1, damping * 30.0), 1e-6, 1e6)
+        if iteration >= REWEIGHTED_AT and settled.all():
             break
-    return _finish(patches, parameters, others, kept, moved)
+    return _finish(patches, parameters, here, weights, prior, moved)
 
 
-def _finish(patches: Patches, parameters: Array, others: Array, kept: NDArray[np.bool_], moved: Array) -> Fit:
-    weights = _weights(patches, parameters, others, kept)
-    model, jacobian = _model(patches, parameters, others)
-    residual, chi2 = _residuals(patches, model, weights)
-    information, _ = _normal_equations(patches, model, jacobian, residual, weights)
-    information += np.diag(_PRIOR)
-    ridge = 1e-9 * np.einsum("nii,ij->nij", information, _EYE) + 1e-12 * _EYE
-    covariance = np.linalg.inv(information + ridge)[:, :2, :2]
-    dof = np.maximum((weights > 0).sum(axis=1) - PARAMETERS, 1)
-    chi2_per_dof = chi2 / dof
-    covariance *= np.maximum(chi2_per_dof, LEAST_CHI2)[:, None, None]
+def _finish(patches: Patches, parameters: Array, here: _Evaluation, weights: Array, prior: Array, moved: Array) -> Fit:
+    information, _ = _normal_equations(patches, here, weights)
+    information += prior
+    ridge = (1e-9 * _diagonal(information) + 1e-12)[:, None, :] * _EYE
+    covariance = np.asarray(np.linalg.inv(information + ridge)[:, :2, :2], np.float64)
+    dof = np.maximum(patches.sums((weights > 0).astype(np.float64)) - PARAMETERS, 1.0)
+    chi2_per_dof = here.chi2 / dof
+    covariance = covariance * np.maximum(chi2_per_dof, LEAST_CHI2)[:, None, None]
     finite = np.isfinite(parameters).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     return Fit(parameters, covariance, chi2_per_dof, finite & (moved < 10 * CONVERGED_PX))
 
 
-def _model(patches: Patches, parameters: Array, others: Array) -> tuple[Array, Array]:
-    """Grey levels (N, P), and their derivatives (N, 8, P)."""
-    u, v, amplitude, background, radius, blur, stretch, shear = (parameters[:, k, None] for k in range(PARAMETERS))
+def _evaluate(patches: Patches, parameters: Array, others: Array) -> _Evaluation:
+    table = parameters.T.copy()
+    table[EDGE] = np.expm1(table[EDGE])
+    u, v, amplitude, background, uu, vv, uv, beta = patches.spread(table)
     du, dv = patches.u_px - u, patches.v_px - v
-    towards_u, towards_v = (1.0 + stretch) * du + shear * dv, (1.0 - stretch) * dv + shear * du
-    rho = np.sqrt(du * towards_u + dv * towards_v) + 1e-9
-    outer, inner = (radius + rho) / blur, (radius - rho) / blur
-    norm = 2.0 * erf(radius / (_ROOT_2 * blur))
-    profile = (erf(outer / _ROOT_2) + erf(inner / _ROOT_2)) / norm
-    scale = 2.0 / (_ROOT_2PI * blur * norm)
-    g_outer, g_inner = scale * np.exp(-0.5 * outer * outer), scale * np.exp(-0.5 * inner * inner)
-    g_centre = 2.0 * scale * np.exp(-0.5 * (radius / blur) ** 2)
-    jacobian = np.empty((len(parameters), PARAMETERS, rho.shape[1]))
-    slope = amplitude * (g_inner - g_outer) / rho  # −A f'(ρ) / ρ
-    jacobian[:, U] = slope * towards_u
-    jacobian[:, V] = slope * towards_v
-    jacobian[:, STRETCH] = slope * (dv * dv - du * du) / 2.0
-    jacobian[:, SHEAR] = -slope * du * dv
-    jacobian[:, AMPLITUDE] = profile
-    jacobian[:, BACKGROUND] = 1.0
-    jacobian[:, RADIUS] = amplitude * (g_outer + g_inner - profile * g_centre)
-    jacobian[:, BLUR] = -amplitude * (outer * g_outer + inner * g_inner - profile * g_centre * radius / blur)
-    return background + amplitude * profile + others, jacobian
-
-
-def _weights(patches: Patches, parameters: Array, others: Array, kept: NDArray[np.bool_]) -> Array:
-    """Inverse variances (N, P); 0 for pixels that are not to be used."""
-    light = spot_light(parameters, patches.u_px, patches.v_px) + others
-    return kept / (patches.background_sigma**2 + patches.shot_gain * np.maximum(light, 0.0))
-
-
-def _foreign_light(patches: Patches, parameters: Array, others: Array, residual: Array) -> NDArray[np.bool_]:
-    """(N, P) pixels beside the spot that are 3 σ brighter than it makes them: shine too faint to be a spot."""
-    light = spot_light(parameters, patches.u_px, patches.v_px)
-    variance = patches.background_sigma**2 + patches.shot_gain * np.maximum(light + others, 0.0)
-    beside = light < 0.25 * parameters[:, AMPLITUDE, None]
-    return np.asarray(beside & (residual > 3.0 * np.sqrt(variance)))
-
-
-def _residuals(patches: Patches, model: Array, weights: Array) -> tuple[Array, Array]:
-    """Measured minus model (N, P), 0 where a saturated pixel has nothing to say; and χ² (N,)."""
-    residual = patches.values - model
+    towards_u, towards_v = uu * du + uv * dv, vv * dv + uv * du
+    rise = np.exp(np.minimum(du * towards_u + dv * towards_v, _LARGEST_T))
+    below = 1.0 / (beta + rise)
+    profile = (1.0 + beta) * below
+    light = amplitude * profile
+    fall = light * rise * below  # −A f'(t)
+    jacobian = np.empty((PARAMETERS + 1, len(du)))
+    np.multiply(2.0 * fall, towards_u, out=jacobian[U])
+    np.multiply(2.0 * fall, towards_v, out=jacobian[V])
+    jacobian[AMPLITUDE] = profile
+    jacobian[BACKGROUND] = 1.0
+    np.multiply(-fall * du, du, out=jacobian[CURVE_UU])
+    np.multiply(-fall * dv, dv, out=jacobian[CURVE_VV])
+    np.multiply(-2.0 * fall * du, dv, out=jacobian[CURVE_UV])
+    np.multiply(light, 1.0 - profile, out=jacobian[EDGE])
+    residual = patches.values - background - light - others
+    # a saturated pixel has nothing to say once the model is beyond it
     residual[(patches.values >= patches.saturation) & (residual < 0.0)] = 0.0
-    return residual, np.einsum("np,np,np->n", residual, residual, weights)
+    jacobian[PARAMETERS] = residual
+    return _Evaluation(light, jacobian, np.empty(0))
 
 
-def _normal_equations(
-    patches: Patches, model: Array, jacobian: Array, residual: Array, weights: Array
-) -> tuple[Array, Array]:
-    """Fisher information (N, 8, 8) and gradient (N, 8) of the pixels; censored ones carry none."""
-    active = weights * ~((patches.values >= patches.saturation) & (model >= patches.saturation))
-    weighted = jacobian * active[:, None, :]
-    return weighted @ jacobian.transpose(0, 2, 1), np.einsum("nkp,np->nk", weighted, residual)
+def _chosen(patches: Patches, better: NDArray[np.bool_], there: _Evaluation, here: _Evaluation) -> _Evaluation:
+    """``there`` for the spots that are better off there, ``here`` for the others."""
+    go = np.repeat(better, patches.counts)
+    jacobian = np.where(go, there.jacobian, here.jacobian)
+    return _Evaluation(np.where(go, there.light, here.light), jacobian, np.where(better, there.chi2, here.chi2))
 
 
-def _bounded(trial: Array, parameters: Array, start: Array) -> Array:
-    """Steps kept sane: 1 px for the centre, a factor of two for amplitude, disc and blur."""
+def _weights(patches: Patches, light: Array, others: Array, kept: Array) -> Array:
+    """Inverse variances (K,); 0 for pixels that are not to be used."""
+    return kept / (patches.background_sigma**2 + patches.shot_gain * np.maximum(light + others, 0.0))
+
+
+def _chi2(patches: Patches, there: _Evaluation, weights: Array) -> Array:
+    residual = there.jacobian[PARAMETERS]
+    return patches.sums(residual * residual * weights)
+
+
+def _own_light(patches: Patches, parameters: Array, here: _Evaluation, others: Array) -> Array:
+    """(K,) 0 for pixels beside the spot that are 3 σ brighter than it makes them: shine too faint to be a spot."""
+    variance = patches.background_sigma**2 + patches.shot_gain * np.maximum(here.light + others, 0.0)
+    beside = here.light < 0.25 * patches.spread(parameters[:, AMPLITUDE])
+    foreign = beside & (here.jacobian[PARAMETERS] > 3.0 * np.sqrt(variance))
+    return np.asarray(1.0 - foreign, np.float64)
+
+
+def _normal_equations(patches: Patches, here: _Evaluation, weights: Array) -> tuple[Array, Array]:
+    """Fisher information (N, 8, 8) and gradient (N, 8); saturated pixels that the model saturates carry none."""
+    censored = (patches.values >= patches.saturation) & (here.jacobian[PARAMETERS] == 0.0)
+    weighted = here.jacobian[:PARAMETERS] * np.where(censored, 0.0, weights)
+    both = np.empty((len(patches.counts), PARAMETERS, PARAMETERS + 1))
+    begin = 0
+    for spot, count in enumerate(patches.counts.tolist()):
+        own = slice(begin, begin + count)
+        np.matmul(weighted[:, own], here.jacobian[:, own].T, out=both[spot])
+        begin += count
+    return both[:, :, :PARAMETERS].copy(), both[:, :, PARAMETERS].copy()
+
+
+def _prior(start: Array) -> Array:
+    """(N, 8, 8) information about the shape, pulling towards the start's circle."""
+    total = start[:, CURVE_UU] + start[:, CURVE_VV]
+    prior = np.zeros((len(start), PARAMETERS, PARAMETERS))
+    shape = _SHAPE_WEIGHT / total**2
+    prior[:, CURVE_UU, CURVE_UU] = prior[:, CURVE_VV, CURVE_VV] = shape
+    prior[:, CURVE_UU, CURVE_VV] = prior[:, CURVE_VV, CURVE_UU] = -shape
+    prior[:, CURVE_UV, CURVE_UV] = 4.0 * shape
+    prior[:, EDGE, EDGE] = _EDGE_WEIGHT
+    return prior
+
+
+def _pull(prior: Array, change: Array) -> Array:
+    return np.asarray(np.sum((prior @ change[:, :, None])[:, :, 0] * change, axis=1))
+
+
+def _diagonal(matrices: Array) -> Array:
+    return np.asarray(np.diagonal(matrices, axis1=1, axis2=2))
+
+
+def _bounded(trial: Array, parameters: Array) -> Array:
+    """Steps kept sane: 1 px for the centre, a factor of two for amplitude and size; still an ellipse."""
     bounded = trial.copy()
     bounded[:, :2] = np.clip(trial[:, :2], parameters[:, :2] - 1.0, parameters[:, :2] + 1.0)
-    for k, least in ((AMPLITUDE, 1.0), (RADIUS, 0.05), (BLUR, 0.25)):
-        bounded[:, k] = np.clip(trial[:, k], np.maximum(parameters[:, k] / 2, least), parameters[:, k] * 2 + least)
-    bounded[:, STRETCH:] = np.clip(trial[:, STRETCH:], -0.5, 0.5)  # still an ellipse
-    bounded[:, RADIUS] = np.minimum(bounded[:, RADIUS], 4.0 * start[:, RADIUS] + 4.0)
+    bounded[:, AMPLITUDE] = np.clip(trial[:, AMPLITUDE], parameters[:, AMPLITUDE] / 2, parameters[:, AMPLITUDE] * 2 + 1)
+    before = parameters[:, CURVE_UU] + parameters[:, CURVE_VV]
+    after = trial[:, CURVE_UU] + trial[:, CURVE_VV]
+    total = np.clip(after, before / 2.0, np.minimum(before * 2.0, 16.0))
+    shape = trial[:, CURVE_UU : CURVE_UV + 1] * (total / np.where(after > 0.0, after, 1.0))[:, None]
+    bounded[:, CURVE_UU] = np.clip(shape[:, 0], 0.25 * total, 0.75 * total)
+    bounded[:, CURVE_VV] = total - bounded[:, CURVE_UU]
+    bounded[:, CURVE_UV] = np.clip(shape[:, 2], -0.25 * total, 0.25 * total)
+    step = np.clip(trial[:, EDGE] - parameters[:, EDGE], -1.5, 1.5)
+    bounded[:, EDGE] = np.clip(parameters[:, EDGE] + step, LEAST_EDGE, MOST_EDGE)
     return bounded
