@@ -39,7 +39,7 @@ class TestAccuracy:
     )
     def test_random_states(self, xhale, random_states, kind, sigma_mm, shape_mm, twist_deg) -> None:
         rng = np.random.default_rng(11)
-        truths = random_states(xhale, kind, 30, rng)
+        truths = random_states(xhale, kind, 16, rng)
         fits = [fit_noisy(xhale, truth, 1e-3 * sigma_mm, rng) for truth in truths]
         assert all(fit.converged for fit in fits)
         assert not any(fit.outlier.any() for fit in fits)
@@ -112,12 +112,12 @@ class TestCovariance:
     def test_errors_are_as_large_as_their_sigmas_say(self, xhale, random_states, kind) -> None:
         """Squared errors over variances average to about one; below, as the marker model's σ is not in this noise."""
         rng = np.random.default_rng(13)
-        truths = random_states(xhale, kind, 60, rng)
+        truths = random_states(xhale, kind, 30, rng)
         fits = [fit_noisy(xhale, truth, 3e-3, rng) for truth in truths]
         pairs = list(zip(fits, truths, strict=True))
         shape = np.mean([((f.position_m - t.position_m)[3:] / f.sigma_position_m[3:]) ** 2 for f, t in pairs])
         twist = np.mean([((f.twist_rad - t.twist_rad)[3:] / f.sigma_twist_rad[3:]) ** 2 for f, t in pairs])
-        # neighbouring nodes err together: 60 states × some 10 independent numbers, so ±20 % at two sigma, and the
+        # neighbouring nodes err together: 30 states × some 10 independent numbers, so ±25 % at two sigma, and the
         # prior is wider than these states are
         assert 0.6 < shape < 1.25
         assert 0.6 < twist < 1.25
