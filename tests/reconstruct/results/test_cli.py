@@ -229,3 +229,38 @@ class TestErrors:
     def test_both_table_and_flight(self, table: Path, wing_file: Path, tmp_path: Path) -> None:
         done = reconstruct(tmp_path, "--markers", table, "--wing", wing_file, "-o", tmp_path / "out")
         assert "not both" in error_line(done, 2)
+
+
+def test_close_lights_a_reference_and_smoothing_are_named(bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
+    """Lights 140 mm apart in the file are not 10: with 30 mm of noise they might as well be, and the report says so."""
+    pq.write_table(bending_wing().marker_table(np.arange(8) * 0.04, sigma_m=0.03), tmp_path / "markers.parquet")
+    described = wing_file.read_text() + '\nloads = "everywhere"\n'
+    described += "[stiffness_sigma]\nGJ = 0.1\nEI_out = 0.1\n"
+    (tmp_path / "wing.toml").write_text(described)
+    arguments = ("run", tmp_path / "markers.parquet", "--wing", tmp_path / "wing.toml", "-o", tmp_path / "out")
+    done = reconstruct(*arguments, "--reference-window", "0:0.2", "--smooth", "0.3", "--json", "--no-csv")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["reference"] == "mean of 0 to 0.2 s"
+    assert summary["smoothed_s"] == 0.3
+    assert summary["warnings"][0].startswith("Twist is predicted from stiffness")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Twist is predicted from stiffness" in page
+    assert "displacements are from the mean of 0 to 0.2 s" in page
+    shape = pq.read_table(tmp_path / "out" / "shape.parquet")
+    assert {"curvature_out_1pm", "sigma_curvature_twist_1pm"} <= set(shape.column_names)
+    told = error_line(reconstruct(*arguments, "--reference-window", "9:10"), 2)
+    assert "no set of the" in told
+    both = reconstruct(*arguments, "--reference-window", "0:1", "--reference", tmp_path)
+    assert "not both" in error_line(both, 2)
+
+
+def test_stiffness_found_at_stations_is_in_the_report(bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
+    pq.write_table(bending_wing().marker_table(np.arange(4) * 0.04, sigma_m=0.001), tmp_path / "markers.parquet")
+    described = wing_file.read_text() + '\nloads = "stations"\n[stiffness_sigma]\nGJ = 0.1\nEI_out = 0.1\nEI_in = 0.1\n'
+    (tmp_path / "wing.toml").write_text(described)
+    done = reconstruct("run", tmp_path / "markers.parquet", "--wing", tmp_path / "wing.toml", "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert 1 < summary["sigma_stiffness_percent"]["GJ"] < 11
+    assert "GJ found, against the wing file" in (tmp_path / "out" / "report.html").read_text()
