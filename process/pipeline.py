@@ -6,8 +6,9 @@ depend on how many processes made it.
 
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -130,21 +131,52 @@ def _blocks(recording: Recording) -> Iterator[list[SetPlaces]]:
 
 def _run(blocks: list[list[SetPlaces]], rig: Rig, settings: PipelineSettings, workers: int) -> Iterator[_Block]:
     """The blocks' results, in order."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield from _run_here_and_there(blocks, rig, settings, workers)
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def _run_here_and_there(
+    blocks: list[list[SetPlaces]], rig: Rig, settings: PipelineSettings, workers: int
+) -> Iterator[_Block]:
     if workers <= 1:
-        threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)
-        try:
-            for block in blocks:
-                yield _process_block(block, rig, settings)
-        finally:
-            cv2.setNumThreads(threads)
+        for block in blocks:
+            yield _process_block(block, rig, settings)
         return
     with (
         _one_blas_thread(),
         # spawned, not forked: a forked child inherits locks of the parent's threads
-        ProcessPoolExecutor(workers, get_context("spawn"), _set_up_worker, (rig, settings)) as pool,
+        ProcessPoolExecutor(workers - 1, get_context("spawn"), _set_up_worker, (rig, settings)) as pool,
     ):
-        yield from pool.map(_process_block_of_worker, blocks)
+        yield from _shared_out(blocks, rig, settings, pool, 2 * (workers - 1))
+
+
+def _shared_out(
+    blocks: list[list[SetPlaces]], rig: Rig, settings: PipelineSettings, pool: ProcessPoolExecutor, ahead: int
+) -> Iterator[_Block]:
+    """The blocks' results, in order; this process works, too, above all while the others are still starting.
+
+    ``ahead`` blocks at most are handed to the pool at a time.
+    """
+    waiting = deque(enumerate(blocks))
+    running: dict[Future[_Block], int] = {}
+    done: dict[int, _Block] = {}
+    for number in range(len(blocks)):
+        while number not in done:
+            while waiting and len(running) < ahead:
+                place, block = waiting.popleft()
+                running[pool.submit(_process_block_of_worker, block)] = place
+            if waiting:
+                place, block = waiting.popleft()
+                done[place] = _process_block(block, rig, settings)
+            else:
+                wait(running, return_when=FIRST_COMPLETED)
+            for future in [future for future in running if future.done()]:
+                done[running.pop(future)] = future.result()
+        yield done.pop(number)
 
 
 @contextmanager

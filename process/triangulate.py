@@ -16,8 +16,8 @@ from process.camera_model import CameraModel, RigSide, StereoPair
 Array = NDArray[np.float64]
 Method = Literal["default", "paper"]
 
-GAUSS_NEWTON_STEPS = 4
-"""From a linear start a centroid's error away from the optimum each step squares what is left: 2 are enough."""
+GAUSS_NEWTON_STEPS = 3
+"""From a linear start a centroid's error away from the optimum each step squares what is left: 2 are enough, 3 are safe."""
 LEAST_PARALLAX = 1e-6  # sine of the angle between rays that counts as parallel
 
 
