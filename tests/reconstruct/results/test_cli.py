@@ -150,6 +150,7 @@ def test_frames_go_through_the_marker_pipeline(
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["flights"] == [str(disk) for disk in disks]
 
 
+@pytest.mark.slow
 def test_a_result_is_a_reference_too(out: Path, tmp_path: Path) -> None:
     done = reconstruct("compare", out, out, "-o", tmp_path / "compared", "--json")
     assert done.returncode == 0, done.stderr
@@ -231,6 +232,7 @@ class TestErrors:
         assert "not both" in error_line(done, 2)
 
 
+@pytest.mark.slow
 def test_close_lights_a_reference_and_smoothing_are_named(bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
     """Lights 140 mm apart in the file are not 10: with 30 mm of noise they might as well be, and the report says so."""
     pq.write_table(bending_wing().marker_table(np.arange(8) * 0.04, sigma_m=0.03), tmp_path / "markers.parquet")
@@ -255,6 +257,7 @@ def test_close_lights_a_reference_and_smoothing_are_named(bending_wing: Any, win
     assert "not both" in error_line(both, 2)
 
 
+@pytest.mark.slow
 def test_stiffness_found_at_stations_is_in_the_report(bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
     pq.write_table(bending_wing().marker_table(np.arange(4) * 0.04, sigma_m=0.001), tmp_path / "markers.parquet")
     described = wing_file.read_text() + '\nloads = "stations"\n[stiffness_sigma]\nGJ = 0.1\nEI_out = 0.1\nEI_in = 0.1\n'

@@ -122,6 +122,7 @@ def test_a_long_flight_is_drawn_as_range_and_in_detail(result: Path) -> None:
     assert np.nanmax(np.asarray(whole.lines[0].get_xdata())) > 40.0
 
 
+@pytest.mark.slow
 def test_one_wing_and_one_set_are_enough(bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
     table = bending_wing().marker_table(np.array([0.0]), sigma_m=0.001)
     pq.write_table(table.filter(np.asarray(table.column("side")) == "right"), tmp_path / "right.parquet")
@@ -143,6 +144,7 @@ def test_nothing_fitted_is_an_error_that_says_why(bending_wing: Any, wing_file: 
         write_report(read_result(tmp_path / "out"), tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_a_new_run_removes_the_old_comparison(bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
     pq.write_table(bending_wing().marker_table(np.arange(3) * 0.04), tmp_path / "table.parquet")
     (tmp_path / "out").mkdir()

@@ -108,6 +108,7 @@ class TestSeries:
             assert np.mean(np.abs(z) < 1.96) > 0.9
             assert np.mean(found.chi2 / found.dof) == pytest.approx(1.0, abs=0.3)
 
+    @pytest.mark.slow
     def test_the_number_of_workers_changes_nothing(self, bending_wing: Any, wing_file: Path) -> None:
         table = bending_wing().marker_table(np.arange(BLOCK_SETS + 3) * 0.04, sigma_m=SIGMA_M)
         series, wing = marker_series(table, "made"), read_wing(wing_file)
