@@ -8,6 +8,7 @@ matched again more tightly. With one, they are the previous places, moved on.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -40,6 +41,14 @@ class MatchSettings:
     """squared Mahalanobis distance from which "not seen" is the better explanation"""
     least_margin: float = 6.0
     """a runner-up closer than this, in squared Mahalanobis distance, makes a marker ``ambiguous``"""
+    stretch_m: float = 0.002
+    """one sigma of the distance between neighbouring lights, besides the spots' noise: a wing bends, it does not …"""
+    stretch: float = 0.004
+    """… stretch; and of the part that calibration adds in proportion to the distance"""
+    epipolar_spread_px: float = 0.05
+    """least sigma of a light's epipolar distance about the others' of its frame set, which share the calibration"""
+    least_likeness: float = 4.5
+    """sigmas from its neighbours' distances, or from the others' epipolar distance, that make a marker ``ambiguous``"""
     start_sigma_m: tuple[float, float, float] = (0.06, 0.035, 0.20)
     """span, chord and normal, without a previous frame"""
     track_sigma_m: tuple[float, float, float] = (0.015, 0.015, 0.05)
@@ -83,6 +92,8 @@ class _Candidates:
     spot0: Indices
     spot1: Indices
     xyz_m: Array
+    covariance_m2: Array
+    epipolar_px: Array  # signed
     epipolar_d2: Array
 
 
@@ -117,8 +128,9 @@ def match(
     chosen, places, cost = result
     margin = _margins(candidates, chosen, cost, settings.none_cost)
     seen = chosen != UNSEEN
-    ambiguous = seen & ~(margin >= settings.least_margin)
-    next_track = _next_track(candidates, chosen, places, trigger_index, track)
+    odd = _odd_ones(wing, candidates, chosen, settings)
+    ambiguous = seen & (odd | ~(margin >= settings.least_margin))
+    next_track = _next_track(candidates, np.where(odd, UNSEEN, chosen), places, trigger_index, track)
     return Matches(
         np.where(seen, _picked(candidates.spot0, chosen), UNSEEN),
         np.where(seen, _picked(candidates.spot1, chosen), UNSEEN),
@@ -139,6 +151,7 @@ class _Wing:
         self.height_m = layout.height_m
         self.span_m = float(pairs[-1])
         self.count = len(self.station_m)
+        self.offset_m = np.stack([self.station_m, self.chord_m], axis=1)
         # columns of what the wing can be bent by: s … s⁴ along the axis, and c, c s, c s² for its sections
         s, c = self.station_m / self.span_m, self.chord_m / 0.1
         self.basis = np.stack([s, s**2, s**3, s**4, c, c * s, c * s**2], axis=1)
@@ -195,7 +208,14 @@ def _candidates(
     reach_m = 1.1 * layout.pairs_station_m[-1] + 0.2
     with np.errstate(invalid="ignore"):
         inside = (np.linalg.norm(points.xyz_m, axis=1) < reach_m) & (outboard_m > -0.1)
-    return _Candidates(spot0[inside], spot1[inside], points.xyz_m[inside], d2[spot0, spot1][inside])
+    return _Candidates(
+        spot0[inside],
+        spot1[inside],
+        points.xyz_m[inside],
+        points.covariance_m2[inside],
+        distance_px[spot0, spot1][inside],
+        d2[spot0, spot1][inside],
+    )
 
 
 def _start(wing: _Wing, candidates: _Candidates, settings: MatchSettings) -> _Result:
@@ -324,6 +344,44 @@ def _margins(candidates: _Candidates, chosen: Indices, cost: Array, none_cost: f
         best_free = cost[marker, free].min(initial=np.inf) - own[k]
         margin[marker] = min(best_free, swap[k].min(initial=np.inf), none_cost - own[k])
     return margin
+
+
+def _odd_ones(wing: _Wing, candidates: _Candidates, chosen: Indices, settings: MatchSettings) -> NDArray[np.bool_]:
+    """(M,) seen markers that are unlike the rest, as a false pair of spots in a missing marker's place is.
+
+    A false pair has any place along a ray, and any epipolar distance within the gate. True lights keep their distances
+    from their neighbours, however the wing bends (0.4 m bent to a radius of 3 m shorten by 0.3 mm), and share the
+    calibration's epipolar error.
+    """
+    odd = np.zeros(wing.count, dtype=bool)
+    seen = np.flatnonzero(chosen != UNSEEN)
+    if len(seen) < 4:
+        return odd
+    epipolar_px = candidates.epipolar_px[chosen[seen]]
+    off_px = np.abs(epipolar_px - np.median(epipolar_px))
+    odd[seen] = off_px > settings.least_likeness * max(settings.epipolar_spread_px, 1.4826 * float(np.median(off_px)))
+    edges = _edges(seen)
+    first, second = edges.T
+    apart = _picked(candidates.xyz_m, chosen)[first] - _picked(candidates.xyz_m, chosen)[second]
+    length_m = np.linalg.norm(apart, axis=1)
+    rest_m = np.linalg.norm(wing.offset_m[first] - wing.offset_m[second], axis=1)
+    covariance = _picked(candidates.covariance_m2, chosen)
+    along = apart / length_m[:, None]
+    noise_m2 = np.einsum("ni,nij,nj->n", along, covariance[first] + covariance[second], along)
+    sigma_m = np.sqrt(noise_m2 + settings.stretch_m**2 + (settings.stretch * rest_m) ** 2)
+    bad = ~(np.abs(length_m - rest_m) <= settings.least_likeness * sigma_m)
+    odd[edges[bad].ravel()] = True  # both ends: which one is wrong is not known, and false pairs are rare
+    return odd
+
+
+def _edges(seen: Indices) -> Indices:
+    """(E, 2) markers that are neighbours among ``seen``: the two of a pair, and the next one outboard of each row."""
+    there = set(seen.tolist())
+    edges = [(marker, marker + 1) for marker in seen.tolist() if marker % 2 == 0 and marker + 1 in there]
+    for row in (0, 1):
+        members = [marker for marker in seen.tolist() if marker % 2 == row]
+        edges += list(pairwise(members))
+    return np.array(edges, dtype=np.intp).reshape(-1, 2)
 
 
 def _next_track(

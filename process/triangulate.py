@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Method = Literal["default", "paper"]
 
 GAUSS_NEWTON_STEPS = 3
-"""From a linear start a centroid's error away from the optimum each step squares what is left: 2 are enough, 3 are safe."""
+"""From a linear start a centroid's error away from the optimum each step squares what is left: 2 are enough."""
 LEAST_PARALLAX = 1e-6  # sine of the angle between rays that counts as parallel
 
 

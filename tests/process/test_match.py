@@ -1,10 +1,14 @@
 """Matching and identity on wings of known shape, with spots missing and spots that are not there."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from process.camera_model import Rig, StereoPair
 from process.detect import Detections
 from process.match import UNSEEN, Matches, MatchSettings, match
 
@@ -119,6 +123,60 @@ def test_following_a_moving_wing_with_gaps(world):
         missed += np.setdiff1d(scene.both(), np.flatnonzero(found.seen)).size
     assert wrong <= 3
     assert missed <= 3
+
+
+def fly(world, seed, frames, measured_with=None):
+    """Identities, visible, rightly and unflagged, wrong, wrong and unflagged, of a wing whose tip moves up to 60 mm a
+    frame; a tenth of the spots missing, two false ones in each image."""
+    rng = np.random.default_rng(seed)
+    side = ("left", "right")[seed % 2]
+    mean, sway, phase = rng.uniform(0.05, 0.2), rng.uniform(0.05, 0.12), rng.uniform(0, 2 * np.pi, 3)
+    step = 0.060 / (2.8**2 / 2 * sway)  # the tip is at s²/2 times the curvature
+    track, counts = None, np.zeros(5, dtype=int)
+    for frame in range(frames):
+        curvature = mean + sway * np.sin(step * frame + phase[0])
+        twist, sweep = 0.06 * np.sin(0.31 * frame + phase[1]), 0.02 * np.sin(0.2 * frame + phase[2])
+        scene = Scene(world, side, world.markers_m(side, curvature, twist, sweep), rng, miss=0.1, ghosts=2)
+        found = find(measured_with or world, side, scene, frame, track)
+        track = found.track or track
+        wrong = np.isin(np.arange(18), scene.wrong(found))
+        right = found.seen & ~wrong & ~found.ambiguous
+        unflagged = wrong & ~found.ambiguous
+        counts += [found.seen.sum(), len(scene.both()), right.sum(), wrong.sum(), unflagged.sum()]
+    return counts
+
+
+def test_a_fast_wing_is_followed(world):
+    seen, visible, right, _, unflagged = sum(fly(world, seed, 60) for seed in range(3))
+    assert seen > 2500
+    assert unflagged == 0
+    assert right >= 0.98 * visible
+
+
+def test_a_calibration_that_is_off_does_not_make_lights_suspect(world):
+    """The pose between the cameras wrong as after a poor calibration: 0.4 px across the epipolar lines, 0.2 % in range."""
+    sides = {}
+    for name in ("left", "right"):
+        side = world.rig.side(name)
+        turned = side.pair.T_cam1_cam0.copy()
+        turned[:3, :3] = cv2.Rodrigues(np.array([3e-4, 1e-4, 3e-4]))[0] @ turned[:3, :3]
+        turned[:3, 3] *= 1.002
+        sides[name] = replace(side, pair=StereoPair(side.pair.cam0, side.pair.cam1, turned))
+    off = replace(world, rig=Rig(sides["left"], sides["right"], world.rig.markers))
+    _, visible, right, _, unflagged = sum(fly(world, seed, 30, off) for seed in range(2))
+    assert unflagged == 0
+    assert right >= 0.98 * visible
+
+
+@pytest.mark.slow
+def test_one_identity_in_a_hundred_thousand_may_be_wrong_and_unflagged(world):
+    seen, visible, right, wrong, unflagged = sum(fly(world, seed, 60) for seed in range(1000, 1350))
+    print(
+        f"{seen} identities, {wrong} wrong, {unflagged} of them unflagged; {right / visible:.5f} of visible ones right"
+    )
+    assert seen >= 300_000
+    assert unflagged <= seen / 100_000
+    assert right >= 0.98 * visible
 
 
 def test_a_lost_track_is_taken_up_afresh(world):
