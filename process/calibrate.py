@@ -16,6 +16,7 @@ from capture.errors import ProcessError
 from process.board import Board
 from process.bundle import Adjustment, Estimate, Freedom, adjust, residuals_of, rms_px, rotation_matrix
 from process.camera_model import CameraModel, StereoPair, pose_matrix
+from process.shared_error import triangulated_by_calibration
 
 Array = NDArray[np.float64]
 
@@ -307,31 +308,10 @@ def check_poses_differ(corners_px: Array, board: Board, size_px: tuple[int, int]
 def calibration_covariance_m2(pair: StereoPair, points_cam0: Array) -> Array:
     """Covariance (N, 3, 3) of triangulated points (N, 3), cam0's frame, from the calibration's own uncertainty.
 
-    NaN if the pair has no covariance. To first order, for triangulation that minimises reprojection errors:
-    dX/dθ = −(AᵀA)⁻¹AᵀB with A, B the pixels' derivatives by the point and by the parameters.
+    NaN if the pair has no covariance. See ``shared_error`` for points in the body frame, and for displacements.
     """
     points = np.asarray(points_cam0, np.float64).reshape(-1, 3)
     if pair.covariance is None:
         return np.full((len(points), 3, 3), np.nan)
-    by_parameters = np.empty((len(points), 4, 24))
-    values = pair.parameters
-    for index in range(24):
-        step = 1e-6 * max(1.0, abs(values[index]))
-        shift = np.eye(24)[index] * step
-        ahead, behind = (_pixels(pair.with_parameters(values + sign * shift), points) for sign in (1, -1))
-        by_parameters[:, :, index] = (ahead - behind) / (2 * step)
-    R = pair.T_cam1_cam0[:3, :3]
-    by_point = np.concatenate(
-        [
-            pair.cam0.project_with_jacobian(points)[1],
-            pair.cam1.project_with_jacobian(points @ R.T + pair.T_cam1_cam0[:3, 3])[1] @ R,
-        ],
-        axis=1,
-    )
-    response = -np.linalg.pinv(by_point) @ by_parameters
+    response = triangulated_by_calibration(pair, points)
     return np.asarray(response @ pair.covariance @ response.transpose(0, 2, 1))
-
-
-def _pixels(pair: StereoPair, points: Array) -> Array:
-    in_cam1 = points @ pair.T_cam1_cam0[:3, :3].T + pair.T_cam1_cam0[:3, 3]
-    return np.concatenate([pair.cam0.project(points), pair.cam1.project(in_cam1)], axis=1)

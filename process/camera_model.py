@@ -237,7 +237,8 @@ class RigSide:
     """One wing's camera pair as mounted.
 
     ``T_body_cam0`` (4, 4), metres. ``pose_covariance`` (6, 6) is of a small rotation ω (rad, R = exp(ω) R̂) and
-    shift of the translation (m), both in body axes; None if unknown.
+    shift of the translation (m), both in body axes; None if unknown. ``pose_by_calibration`` (6, 24) is how the fitted
+    pose moves with the pair's parameters; None is taken for not at all.
     """
 
     pair: StereoPair
@@ -246,17 +247,21 @@ class RigSide:
     cam1_serial: str
     row_time_ns: float
     pose_covariance: Array | None = None
+    pose_by_calibration: Array | None = None
 
     def __post_init__(self) -> None:
         _freeze(self, "T_body_cam0", self.T_body_cam0, (4, 4))
         _check_pose("T_body_cam0", self.T_body_cam0)
         if self.pose_covariance is not None:
             _freeze(self, "pose_covariance", self.pose_covariance, (6, 6))
+        if self.pose_by_calibration is not None:
+            _freeze(self, "pose_by_calibration", self.pose_by_calibration, (6, 24))
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "T_body_cam0": self.T_body_cam0.tolist(),
             "pose_covariance": None if self.pose_covariance is None else self.pose_covariance.tolist(),
+            "pose_by_calibration": None if self.pose_by_calibration is None else self.pose_by_calibration.tolist(),
             "cam0_serial": self.cam0_serial,
             "cam1_serial": self.cam1_serial,
             "row_time_ns": self.row_time_ns,
@@ -272,6 +277,7 @@ class RigSide:
             str(value["cam1_serial"]),
             float(value["row_time_ns"]),
             value["pose_covariance"],
+            value.get("pose_by_calibration"),
         )
 
 

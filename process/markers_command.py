@@ -22,6 +22,7 @@ from process.detect import DetectSettings
 from process.match import MatchSettings
 from process.pipeline import MarkersResult, PipelineSettings
 from process.pipeline import markers as run_pipeline
+from process.shared_error import with_rig
 from process.tables import write_table
 
 SHOWN_PROBLEMS = 20
@@ -78,7 +79,7 @@ def markers(
     cameras = Rig.read(rig)
     with _progress() as progress:
         result = run_pipeline(flight, cameras, settings, progress, workers)
-    write_table(result.table, output, command=shlex.join(["wingproc", *sys.argv[1:]]), inputs=[rig])
+    write_table(with_rig(result.table, cameras), output, command=shlex.join(["wingproc", *sys.argv[1:]]), inputs=[rig])
     summary = summarise(result)
     if json:
         say_json({**summary, "problems": list(result.problems), "output": str(output)})

@@ -52,6 +52,8 @@ class PoseFit:
     T_body_cam0: Array
     covariance: Array
     """(6, 6) of a small rotation (rad) and shift (m) in body axes; see camera_model.RigSide"""
+    by_calibration: Array
+    """(6, 24) how these change with the pair's parameters, the pictures being the same"""
     points: list[PointFit]
     chi2_ratio: float
     """χ² a degree of freedom: 1 if everything is as good as its sigma says"""
@@ -101,7 +103,7 @@ def solve_pose(
                 "is the survey right, and is this not the other side's pair file?"
             )
         problem = _Problem(pair, surveyed_m[used], sigma_m[used], *_measured(assigned[used], spots0, spots1))
-        T, chi2, covariance, residuals = problem.solve()
+        T, chi2, covariance, residuals, by_calibration = problem.solve()
         worst = int(np.argmax(chi2))
         # measured against the others: with a poor calibration all are beyond their sigmas, and none is the culprit
         if chi2[worst] <= CHI2_LIMIT * max(1.0, float(np.median(chi2)) / 3.36):  # 3.36: median of χ² with 4
@@ -109,7 +111,7 @@ def solve_pose(
         index = int(np.flatnonzero(used)[worst])
         used[index] = False
         reasons[index] = f"does not fit the others (chi2 {chi2[worst]:.0f} of 4): check its coordinates"
-    return _fit(names, surveyed_m, T, covariance, chi2, residuals, used, reasons, in_cam0)
+    return _fit(names, surveyed_m, T, covariance, by_calibration, chi2, residuals, used, reasons, in_cam0)
 
 
 def _fit(
@@ -117,6 +119,7 @@ def _fit(
     surveyed_m: Array,
     T: Array,
     covariance: Array,
+    by_calibration: Array,
     chi2: Array,
     residuals: Array,
     used: NDArray[np.bool_],
@@ -147,7 +150,7 @@ def _fit(
         PointFit(name, bool(use), "" if use else reason, error, pixel)
         for name, use, reason, error, pixel in zip(names, used, reasons, errors, pixels, strict=True)
     ]
-    return PoseFit(T, covariance * max(1.0, ratio), points, ratio, warnings)
+    return PoseFit(T, covariance * max(1.0, ratio), by_calibration, points, ratio, warnings)
 
 
 def triangulate_midpoint(pair: StereoPair, pixels0: Array, pixels1: Array) -> Array:
@@ -306,8 +309,8 @@ class _Problem:
         self._pair, self._surveyed, self._sigma = pair, surveyed_m, sigma_m
         self._pixels, self._whitening = pixels, whitening
 
-    def solve(self) -> tuple[Array, Array, Array, Array]:
-        """T_body_cam0, χ² of each light, the pose's covariance and the residuals in pixels (N, 2, 2)."""
+    def solve(self) -> tuple[Array, Array, Array, Array, Array]:
+        """T_body_cam0, χ² of each light, the pose's covariance, residuals in pixels (N, 2, 2), pose by calibration."""
         points = triangulate_midpoint(self._pair, self._pixels[:, 0], self._pixels[:, 1])
         T = _kabsch(points, self._surveyed)
         count = len(self._surveyed)
@@ -324,9 +327,32 @@ class _Problem:
         residuals, jacobian = self._residuals(moved, np.concatenate([np.zeros(6), solution.x[6:]]))
         by_light = np.hstack([residuals[: 4 * count].reshape(count, 4), residuals[4 * count :].reshape(count, 3)])
         chi2: Array = np.sum(by_light**2, axis=1)
-        covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian)[:6, :6], np.float64)
+        inverse = np.linalg.inv(jacobian.T @ jacobian)
+        covariance = np.asarray(inverse[:6, :6], np.float64)
+        # the optimum stays one when θ changes: Jᵀ J dx + Jᵀ (∂r/∂θ) dθ = 0, to first order
+        by_calibration = -inverse[:6] @ jacobian.T @ self._by_calibration(moved, solution.x[6:])
         projected = np.stack(_project(self._pair, moved, self._surveyed + solution.x[6:].reshape(-1, 3)), axis=1)
-        return moved, chi2, covariance, np.asarray(self._pixels - projected)
+        return moved, chi2, covariance, np.asarray(self._pixels - projected), np.asarray(by_calibration)
+
+    def _by_calibration(self, T: Array, offsets: Array) -> Array:
+        """Derivative (7N, 24) of the residuals by the pair's parameters."""
+        values, x = self._pair.parameters, np.concatenate([np.zeros(6), offsets])
+        slope = np.empty((7 * len(self._surveyed), len(values)))
+        for index, value in enumerate(values):
+            step = np.zeros(len(values))
+            step[index] = 1e-6 * max(1.0, abs(value))
+            ahead, behind = (
+                _Problem(
+                    self._pair.with_parameters(values + sign * step),
+                    self._surveyed,
+                    self._sigma,
+                    self._pixels,
+                    self._whitening,
+                )._residuals(T, x)[0]
+                for sign in (1, -1)
+            )
+            slope[:, index] = (ahead - behind) / (2 * step[index])
+        return slope
 
     def _residuals(self, T_start: Array, x: Array) -> tuple[Array, Array]:
         """Whitened residuals (7N,), pixels then survey, and their Jacobian (7N, 6 + 3N)."""

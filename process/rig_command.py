@@ -79,6 +79,7 @@ def build_rig(pairs: dict[str, StereoPair], survey: Survey, fits: dict[str, Pose
             getattr(survey, name).cam1_serial,
             1000.0 * survey.row_time_us,
             fits[name].covariance,
+            fits[name].by_calibration,
         )
         for name in ("left", "right")
     }

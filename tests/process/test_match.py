@@ -154,7 +154,7 @@ def test_a_fast_wing_is_followed(world):
 
 
 def test_a_calibration_that_is_off_does_not_make_lights_suspect(world):
-    """The pose between the cameras wrong as after a poor calibration: 0.4 px across the epipolar lines, 0.2 % in range."""
+    """The pose between the cameras wrong as after a poor calibration: 0.4 px across epipolar lines, 0.2 % in range."""
     sides = {}
     for name in ("left", "right"):
         side = world.rig.side(name)

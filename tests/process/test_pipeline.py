@@ -14,6 +14,7 @@ from capture.errors import ProcessError
 from process.markers_command import markers as markers_command
 from process.pipeline import PipelineSettings, markers
 from process.recording import open_recording
+from process.shared_error import sides_of
 from process.tables import MARKER_SCHEMA, read_table, table_provenance, write_table
 
 START_NS = 1_700_000_000_123_456_789
@@ -233,3 +234,12 @@ def test_a_block_ends_where_the_trigger_number_says(flight):
 
     cut = [[places.trigger_index for places in block] for block in _blocks(open_recording([flight]))]
     assert cut == [[48, 49], [50, 51], [48, 49], [50, 51]]
+
+
+def test_the_commands_table_carries_the_rig(flight, small_world, tmp_path, capsys):
+    rig_path, out = tmp_path / "rig.json", tmp_path / "markers.parquet"
+    small_world.rig.write(rig_path)
+    assert call(flight, "--rig", rig_path, "-o", out, "--workers", 1, "--json") == 0
+    capsys.readouterr()
+    sides = sides_of(read_table(out, MARKER_SCHEMA))
+    np.testing.assert_array_equal(sides["right"].T_body_cam0, small_world.rig.right.T_body_cam0)

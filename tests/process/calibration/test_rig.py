@@ -264,3 +264,26 @@ def test_a_dark_picture_is_refused_with_its_name(survey_folder):
     cv2.imwrite(str(survey_folder / "left0.png"), np.zeros((1552, 2080), np.uint8))
     with pytest.raises(ProcessError, match=r"left0\.png.*0 of 8 surveyed lights.*other side's pair"):
         command(survey_folder)
+
+
+def test_how_the_pose_moves_with_the_calibration():
+    """Against fits of the same spots with other parameters."""
+    points = lights(10, 21)
+    rng = np.random.default_rng(2)
+    places = points + rng.normal(0.0, SURVEY_SIGMA_M, points.shape)
+    seen = spots(points, 0, rng), spots(points, 1, rng)
+    names, sigma = [f"P{number}" for number in range(len(points))], np.full(len(points), SURVEY_SIGMA_M)
+    fit = solve_pose(PAIR, T_NOMINAL, names, places, sigma, *seen)
+    values = PAIR.parameters
+    for index, step in ((0, 0.03), (2, 0.03), (4, 1e-5), (12, 0.03), (19, 1e-5), (21, 1e-5)):
+        moved = np.empty((2, 4, 4))
+        for k, sign in enumerate((1, -1)):
+            pair = PAIR.with_parameters(values + sign * step * np.eye(24)[index])
+            moved[k] = solve_pose(pair, T_NOMINAL, names, places, sigma, *seen).T_body_cam0
+        between = moved[0, :3, :3] @ moved[1, :3, :3].T
+        turn = (between - between.T)[[2, 0, 1], [1, 2, 0]] / 2.0  # micro-radians, which OpenCV rounds to none
+        slope = np.concatenate([turn, moved[0, :3, 3] - moved[1, :3, 3]]) / (2 * step)
+        scale = np.linalg.norm(fit.by_calibration[:3, index]), np.linalg.norm(fit.by_calibration[3:, index])
+        # the second derivatives of the residuals are left out (Gauss and Newton): they are small beside the first
+        np.testing.assert_allclose(fit.by_calibration[:3, index], slope[:3], atol=0.05 * scale[0])
+        np.testing.assert_allclose(fit.by_calibration[3:, index], slope[3:], atol=0.05 * scale[1])

@@ -1,0 +1,107 @@
+"""Points in the body frame to the error that calibration and mount give them all: the same in every frame.
+
+A point's error is J δ, with δ the errors of the pair's 24 parameters (``camera_model.PAIR_PARAMETER_NAMES``) and of
+its pose's 6 in the body frame. δ is one draw for a whole flight, so that errors of two points, or of a marker at
+two times, go together, and a displacement has the error (J₁ − J₂) δ: mostly far less than either.
+
+The pose was fitted with the calibration at hand, and makes up for part of its errors where the surveyed lights were:
+``RigSide.pose_by_calibration`` says how, and J holds it.
+"""
+
+import json
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import ArrayLike, NDArray
+
+from process.bundle import cross_matrix
+from process.camera_model import PAIR_PARAMETER_NAMES, Rig, RigSide, StereoPair
+
+Array = NDArray[np.float64]
+
+PARAMETERS = len(PAIR_PARAMETER_NAMES) + 6
+METADATA_KEY = b"wingshape_rig"
+
+
+def shared_covariance(side: RigSide) -> Array:
+    """Covariance (30, 30) of δ; NaN where calibration or survey did not estimate theirs."""
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    covariance[:24, :24] = np.nan if side.pair.covariance is None else side.pair.covariance
+    covariance[24:, 24:] = np.nan if side.pose_covariance is None else side.pose_covariance
+    return covariance
+
+
+def shared_jacobian(side: RigSide, points_m: ArrayLike) -> Array:
+    """J (N, 3, 30): metres of ``points_m`` (N, 3), body frame, by δ. NaN where a point is NaN or out of view.
+
+    To first order, for triangulation with the same pixels by least reprojection errors: by the pair's parameters θ,
+    dX/dθ = −A⁺ B with A, B the pixels' derivatives by the point and by θ.
+    """
+    points = np.asarray(points_m, np.float64).reshape(-1, 3)
+    R, t = side.T_body_cam0[:3, :3], side.T_body_cam0[:3, 3]
+    from_pair = points - t
+    by_pair, by_pose = R @ triangulated_by_calibration(side.pair, from_pair @ R), np.zeros((len(points), 3, 6))
+    by_pose[:, :, :3] = -cross_matrix(from_pair)
+    by_pose[:, :, 3:] = np.eye(3)
+    if side.pose_by_calibration is not None:
+        by_pair = by_pair + by_pose @ side.pose_by_calibration
+    return np.concatenate([by_pair, by_pose], axis=2)
+
+
+def point_covariance_m2(side: RigSide, points_m: ArrayLike) -> Array:
+    """Covariance (N, 3, 3) that points (N, 3) have from calibration and mount."""
+    return _carried(side, shared_jacobian(side, points_m))
+
+
+def displacement_covariance_m2(side: RigSide, from_m: ArrayLike, to_m: ArrayLike) -> Array:
+    """Covariance (N, 3, 3) of ``to_m`` − ``from_m`` (N, 3) from calibration and mount; the noise of both adds to it."""
+    return _carried(side, shared_jacobian(side, to_m) - shared_jacobian(side, from_m))
+
+
+def triangulated_by_calibration(pair: StereoPair, points_cam0: Array) -> Array:
+    """(N, 3, 24) by the pair's parameters of points (N, 3), cam0's frame, triangulated from the same pixels.
+
+    NaN where a point is NaN or not in front of both cameras.
+    """
+    by_parameters = np.empty((len(points_cam0), 4, 24))
+    values = pair.parameters
+    for index in range(24):
+        step = 1e-6 * max(1.0, abs(values[index]))
+        shift = np.zeros(24)
+        shift[index] = step
+        ahead, behind = (_pixels(pair.with_parameters(values + sign * shift), points_cam0) for sign in (1, -1))
+        by_parameters[:, :, index] = (ahead - behind) / (2 * step)
+    R = pair.T_cam1_cam0[:3, :3]
+    by_point = np.concatenate(
+        [
+            pair.cam0.project_with_jacobian(points_cam0)[1],
+            pair.cam1.project_with_jacobian(points_cam0 @ R.T + pair.T_cam1_cam0[:3, 3])[1] @ R,
+        ],
+        axis=1,
+    )
+    good = np.isfinite(by_point).all(axis=(1, 2))
+    response = np.full((len(points_cam0), 3, 24), np.nan)
+    response[good] = -np.linalg.pinv(by_point[good]) @ by_parameters[good]
+    return response
+
+
+def with_rig(table: pa.Table, rig: Rig) -> pa.Table:
+    """The marker table with what the functions here need in its schema metadata, once a side."""
+    note = json.dumps({side: rig.side(side).to_dict() for side in ("left", "right")}).encode()
+    return table.replace_schema_metadata({**(table.schema.metadata or {}), METADATA_KEY: note})
+
+
+def sides_of(table: pa.Table) -> dict[str, RigSide]:
+    """``left`` and ``right`` that the marker table was measured with; empty for tables without (a truth's)."""
+    note: dict[str, Any] = json.loads((table.schema.metadata or {}).get(METADATA_KEY, b"{}"))
+    return {name: RigSide.from_dict(value) for name, value in note.items()}
+
+
+def _carried(side: RigSide, jacobian: Array) -> Array:
+    return np.asarray(jacobian @ shared_covariance(side) @ jacobian.transpose(0, 2, 1))
+
+
+def _pixels(pair: StereoPair, points_cam0: Array) -> Array:
+    in_cam1 = points_cam0 @ pair.T_cam1_cam0[:3, :3].T + pair.T_cam1_cam0[:3, 3]
+    return np.concatenate([pair.cam0.project(points_cam0), pair.cam1.project(in_cam1)], axis=1)
