@@ -16,10 +16,10 @@ import mmap
 import shutil
 import statistics
 import tempfile
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,9 @@ from capture.grabber import GRAB_TIMEOUT_S
 from capture.lane import Lane, LaneParts, make_lane
 from capture.ledger import Ledger
 from capture.record import CAMERAS, SIDES
+from capture.recorder import PREALLOCATE_BYTES
+from capture.ring import check_memory
+from capture.segment import FrameLayout
 
 MONOLITHIC_BUFFERS = 2
 SEGMENT_MB = 900.0
@@ -279,6 +282,9 @@ def _lanes(case: BenchCase, folder: Path, disk: Disk, clock: Clock) -> tuple[Led
         lock_memory=True,
     )
     cameras = [ClockedCamera(case, triggers) for _ in places]
+    slot_bytes = FrameLayout(1, 2, "left_cam0", case.width, case.height).slot_bytes
+    check_memory(len(places) * parts.ring_slots * slot_bytes)
+    disk.make_folder(folder)
     lanes = []
     for number, side in enumerate(SIDES):
         disk.make_folder(folder / side)
@@ -295,7 +301,7 @@ def _run_threaded(case: BenchCase, folder: Path, disk: Disk, progress: Callable[
     for lane in lanes:
         lane.start()
     depth: list[tuple[float, int]] = []
-    while not all(camera.finished for camera in cameras):
+    while not all(camera.finished for camera in cameras) and not _broken(lanes):
         clock.sleep(0.1)
         depth.append((time.monotonic() - begin_s, max(g.ring.in_use for ln in lanes for g in ln.grabbers.values())))
         done = max(account.recorded for account in ledger.accounts().values())
@@ -308,6 +314,12 @@ def _run_threaded(case: BenchCase, folder: Path, disk: Disk, progress: Callable[
     latencies = [us / 1000 for lane in lanes for us in lane.recorder.statistics.latencies_us]
     rings = [grabber.ring for lane in lanes for grabber in lane.grabbers.values()]
     return _row(case, dropped, latencies, max(r.high_water for r in rings), rings[0].slots, cpu_cores, seconds, depth)
+
+
+def _broken(lanes: Sequence[Lane]) -> bool:
+    recorders = [lane.recorder for lane in lanes]
+    workers = [*recorders, *(grabber for lane in lanes for grabber in lane.grabbers.values())]
+    return any(recorder.failure for recorder in recorders) or any(worker.error for worker in workers)
 
 
 def _stop(lanes: Sequence[Lane]) -> float:
@@ -341,6 +353,7 @@ def _run_monolithic(case: BenchCase, folder: Path, disk: Disk, progress: Callabl
         area[:] = b"\x07" * len(area)
         for slot in range(buffers):
             camera.queue(slot, memoryview(area)[:size])
+    disk.make_folder(folder)
     files = [_OverwrittenFile(disk, folder / side, side) for side in SIDES]
     latencies: list[float] = []
     triggers.start_ns = time.time_ns() + START_AFTER_NS
@@ -397,7 +410,7 @@ def _ceiling_ours(case: BenchCase, folder: Path) -> float:
         lane.start()
     while not all(account.recorded >= case.frames for account in ledger.accounts().values()):
         clock.sleep(0.002)
-        if any(lane.recorder.failure or lane.recorder.error for lane in lanes):
+        if _broken(lanes):
             break
     seconds = time.monotonic() - begin_s + _stop(lanes)
     recorded = sum(account.recorded for account in ledger.accounts().values())
@@ -410,25 +423,23 @@ def _ceiling_raw(case: BenchCase, folder: Path) -> float:
     buffer = mmap.mmap(-1, size)
     buffer[:] = b"\x07" * size
     disk = BoundedDisk()
+    disk.make_folder(folder)
 
     def write(side: str) -> None:
         disk.make_folder(folder / side)
         per_file = int(SEGMENT_MB * 1e6 / size) + 1
         left, number = 2 * case.frames, 0
         while left > 0:
-            file = disk.create(folder / side / f"raw_{number:04d}", "direct", int(SEGMENT_MB * 1e6))
+            file = disk.create(folder / side / f"raw_{number:04d}", "direct", int(PREALLOCATE_BYTES))
             for _ in range(min(left, per_file)):
                 file.write(memoryview(buffer))
             file.sync()
             file.close()
             left, number = left - per_file, number + 1
 
-    threads = [threading.Thread(target=write, args=(side,)) for side in SIDES]
     begin_s = time.monotonic()
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(len(SIDES)) as threads:
+        list(threads.map(write, SIDES))  # and raise what they raise
     seconds = time.monotonic() - begin_s
     _remove(folder)
     return 4 * case.frames * case.width * case.height / seconds / 1e6

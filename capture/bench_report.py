@@ -12,6 +12,9 @@ PAPER = {(2080, 1552): 3.83, (1920, 1080): 0.9}
 """Dropped frames in percent, the paper's Table 8: fwrite, no buffer, no threads, 30,000 frames at 25 Hz."""
 
 
+PLOT_FORMATS = (".png", ".pdf", ".svg")
+
+
 def table(rows: Sequence[BenchRow]) -> Table:
     """The rows as people read them, the paper's figure beside the monolithic ones."""
     made = Table(

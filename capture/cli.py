@@ -15,10 +15,10 @@ from capture import bench_report
 from capture.bench import CEILING_PAIRS, MODES, bench_cases, bench_target, ceiling, run_case
 from capture.clock import SystemClock
 from capture.config import load_config
-from capture.console import note, run, say, say_json
+from capture.console import Narrator, run, say, say_json
 from capture.daemon import Recording, RecordingResult, StopRule
 from capture.disk import SystemDisk
-from capture.errors import CaptureError
+from capture.errors import CaptureError, UsageError
 from capture.recover import recover_flight
 from capture.verify import FlightReport, inspect
 
@@ -27,6 +27,7 @@ app = typer.Typer(
     add_completion=False,
     help="Record a flight, and say what is in a recording and whether it is whole.",
 )
+PROBLEMS_SHOWN = 50
 FlightFolders = Annotated[list[Path], typer.Argument(help="the flight's folder on each disk, or a folder above them")]
 Json = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
 
@@ -40,11 +41,13 @@ def record(
 ) -> None:
     """Record until SIGTERM, Ctrl-C, or the given number of triggers or seconds."""
     requested = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: requested.set())
-    recording = Recording(load_config(config), SystemClock(), SystemDisk(), note)
-    note(f"recording {recording.flight}")
+    narrator = Narrator()
+    recording = Recording(load_config(config), SystemClock(), SystemDisk(), narrator)
+    narrator(f"recording {recording.flight}")
     result = recording.run(StopRule(requested, triggers, duration))
+    narrator.close()
     if json:
         say_json(result.as_dict())
     else:
@@ -115,7 +118,7 @@ def bench(
     ] = ".",
     mode: Annotated[str, typer.Option(help=f"{', '.join(MODES)} or all")] = "all",
     size: Annotated[str, typer.Option(help="image size WxH, or `paper`: 2080x1552 and 1920x1080")] = "2080x1552",
-    rate: Annotated[float, typer.Option(min=0.1, help="triggers a second")] = 25.0,
+    rate: Annotated[float, typer.Option(min=0.1, max=1000, help="triggers a second")] = 25.0,
     frames: Annotated[int, typer.Option(min=0, help="frames a camera (0: 20 s; the paper's run: 30000)")] = 0,
     find_ceiling: Annotated[bool, typer.Option("--ceiling", help="find the highest rate without loss too")] = False,
     plot: Annotated[Path | None, typer.Option(help="write latency and ring depth in time, to this image")] = None,
@@ -126,6 +129,11 @@ def bench(
     At most 8 GB of the target's space are used, and freed at the end.
     """
     cases = bench_cases(mode, size, rate, frames)
+    if target == "model" and find_ceiling:
+        raise UsageError("--ceiling measures a real disk: give its folder with --target, not `model`")
+    if plot is not None and plot.suffix not in bench_report.PLOT_FORMATS:
+        raise UsageError(f"--plot {plot}: give a file that ends in {', '.join(bench_report.PLOT_FORMATS)}")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the target's space is freed
     with bench_target(target) as (folder, disk), Progress(console=Console(stderr=True), transient=True) as bar:
         rows = []
         for number, case in enumerate(cases):
@@ -180,5 +188,7 @@ def _print_report(report: FlightReport) -> None:
     Console().print(table)
     for remark in report.notes:
         say(f"note: {remark}")
-    for problem in report.problems:
+    for problem in report.problems[:PROBLEMS_SHOWN]:
         say(f"PROBLEM: {problem}")
+    if len(report.problems) > PROBLEMS_SHOWN:
+        say(f"… and {len(report.problems) - PROBLEMS_SHOWN} more: `--json` lists them all")

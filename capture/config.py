@@ -23,7 +23,7 @@ class TriggerConfig(_Table):
 
     port: str
     rate_hz: Annotated[float, Field(gt=0, le=200)] = 25.0
-    first_index: Annotated[int, Field(ge=0)] = 0
+    first_index: Annotated[int, Field(ge=0, lt=2**31)] = 0
 
 
 class DiskConfig(_Table):
@@ -113,6 +113,7 @@ class LoadedConfig:
     config: Config
     text: str
     sha256: str
+    calibration: bytes | None = None  # read once, so that every segment carries the same
 
 
 def load_config(path: Path) -> LoadedConfig:
@@ -133,15 +134,19 @@ def load_config(path: Path) -> LoadedConfig:
     except ValidationError as error:
         raise ConfigError(f"{path}: {_first_problem(error)}") from error
     folder = path.parent
-    disks = config.disks.model_copy(update={"left": folder / config.disks.left, "right": folder / config.disks.right})
+    left, right = (folder / disk.expanduser() for disk in (config.disks.left, config.disks.right))
+    if left.resolve() == right.resolve():
+        raise ConfigError(f"{path}: `disks.left` and `disks.right` are the same folder: give each side one of its own")
+    disks = config.disks.model_copy(update={"left": left, "right": right})
     calibration = folder / config.calibration if config.calibration else None
     if calibration is not None and not calibration.is_file():
         raise ConfigError(
             f"{calibration}: the calibration named in {path} is missing: make it with `wingproc rig`, "
             "or remove the key `calibration`"
         )
+    carried = calibration.read_bytes() if calibration else None
     config = config.model_copy(update={"disks": disks, "calibration": calibration})
-    return LoadedConfig(config, text, hashlib.sha256(raw).hexdigest())
+    return LoadedConfig(config, text, hashlib.sha256(raw).hexdigest(), carried)
 
 
 def _first_problem(error: ValidationError) -> str:

@@ -1,8 +1,11 @@
 """Runs a Typer application so that a user sees one line and an exit code, never a traceback."""
 
+import contextlib
 import json
 import os
+import queue
 import sys
+import threading
 from typing import Any, NoReturn
 
 import typer
@@ -45,8 +48,38 @@ def say(text: str = "") -> None:
 
 
 def note(text: str) -> None:
-    """Print progress or a warning to standard error, so that standard output stays parseable."""
-    print(text, file=sys.stderr, flush=True)  # noqa: T201
+    """Print progress or a warning to standard error, so that standard output stays parseable.
+
+    A standard error that is closed is not worth stopping for.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)  # noqa: T201
+
+
+class Narrator:
+    """``note`` from a thread of its own: whoever calls it never waits for a terminal or a pipe that is stuck.
+
+    At most 64 lines wait; further ones are dropped.
+    """
+
+    def __init__(self) -> None:
+        self._lines: queue.Queue[str | None] = queue.Queue(64)
+        self._thread = threading.Thread(target=self._run, name="narrator", daemon=True)
+        self._thread.start()
+
+    def __call__(self, text: str) -> None:
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(text)
+
+    def close(self) -> None:
+        """Give what is waiting a second to be printed."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(None)
+        self._thread.join(1.0)
+
+    def _run(self) -> None:
+        while (text := self._lines.get()) is not None:
+            note(text)
 
 
 def say_json(value: Any) -> None:

@@ -25,12 +25,14 @@ from capture.lane import Lane, LaneParts, make_lane
 from capture.ledger import CameraAccount, Ledger, Place
 from capture.record import SIDES, Diagnostic, Loss, Trigger, encode_diagnostics
 from capture.recorder import Recorder
-from capture.segment import SmallMessage
+from capture.ring import check_memory
+from capture.segment import FrameLayout, SmallMessage
 from capture.trigger import BoardCount, TriggerBoard, TriggerLog
 from capture.trigger_protocol import Pulse
 
 CONTROL_PERIOD_S = 0.1
 DIAGNOSTICS_PERIOD_S = 1.0
+SILENT_BOARD_S = 2.0  # a running board that has reported no pulse for so long is asked
 DRAIN_DEADLINE_S = 2.0  # how long frames of the last triggers may take to arrive
 FLUSH_DEADLINE_S = 60.0  # how long the disks may take to write what is in the rings
 GIL_SWITCH_S = 0.0005  # the interpreter's 5 ms would let one busy thread hold up a write
@@ -58,6 +60,9 @@ class RecordingResult:
     ring_slots: int
     ring_locked: bool
     seconds: float
+    discarded: dict[Place, int]  # frames that were nobody's: duplicates, and some that no trigger asked for
+    garbled_lines: int  # of the board
+    aux_dropped: int  # small messages that one of the disks did not take
     failures: list[str] = field(default_factory=list)
 
     @property
@@ -86,6 +91,9 @@ class RecordingResult:
             "ring_slots": self.ring_slots,
             "ring_locked": self.ring_locked,
             "ring_high_water": {"/".join(place): n for place, n in self.ring_high_water.items()},
+            "frames_discarded": {"/".join(place): n for place, n in self.discarded.items()},
+            "board_lines_garbled": self.garbled_lines,
+            "aux_messages_dropped": self.aux_dropped,
             "seconds": self.seconds,
             "failures": self.failures,
         }
@@ -143,6 +151,8 @@ class Recording:
         self._cameras: dict[Place, tuple[Camera, CameraDescription]] = {}
         self._lanes: dict[str, Lane] = {}
         self._failures: list[str] = []
+        self._counter_before: int | None = None  # the board's, before our first pulse
+        self._pulse_s = 0.0  # when the last pulse was reported
         self._flight_id = f"{self.flight}-{clock.utc_ns():x}"
         places = [(camera.side, camera.name) for camera in self._config.cameras]
         self._ledger = Ledger(places, self._config.trigger.first_index, clock.utc_ns, self._aux.loss)
@@ -164,14 +174,18 @@ class Recording:
             before = board.end()  # it may still be running for a recorder that was killed
             board.set_rate(self._config.trigger.rate_hz)
             self._make_lanes(name)
-            for lane in self._lanes.values():
-                lane.start()
+            self._counter_before = before.counter
             started_s = self._clock.monotonic_s()
-            board.begin(self._config.trigger.first_index, stop.triggers)
-            self._control(board, stop, started_s)
+            try:
+                for lane in self._lanes.values():
+                    lane.start()
+                board.begin(self._config.trigger.first_index, stop.triggers)
+                self._control(board, stop, started_s)
+            except Exception as error:  # whatever it is: what was recorded is closed and accounted for
+                self._failures.append(f"{type(error).__name__}: {error}")
             count = self._end_triggers(board)
             seconds = self._clock.monotonic_s() - started_s
-            return self._finish(before, count, seconds)
+            return self._finish(before, count, seconds, board)
 
     @property
     def _grabbers(self) -> dict[Place, Grabber]:
@@ -182,6 +196,9 @@ class Recording:
         return {side: lane.recorder for side, lane in self._lanes.items()}
 
     def _on_pulse(self, pulse: Pulse, trigger: Trigger) -> None:
+        if self._counter_before is None or pulse.counter <= self._counter_before:
+            return  # still of a recording before ours
+        self._pulse_s = self._clock.monotonic_s()
         self._triggers.add(pulse)
         self._ledger.triggered(pulse.index + 1)
         self._aux.trigger(trigger)
@@ -214,8 +231,9 @@ class Recording:
             clock=self._clock,
             ring_slots=self._config.ring_slots,
             lock_memory=self._config.ring.lock_memory,
-            calibration=self._config.calibration,
+            calibration=self._calibration(),
         )
+        check_memory(self._ring_bytes())
         sides = [side for side in SIDES if any(place[0] == side for place in self._cameras)]
         folders = {side: self._make_folder(side) for side in sides}
         for side in sides:
@@ -232,6 +250,15 @@ class Recording:
             f"bridges a disk stall of {self._config.ring.stall_s:g} s"
         )
 
+    def _calibration(self) -> tuple[str, bytes] | None:
+        path, content = self._config.calibration, self._loaded.calibration
+        return None if path is None or content is None else (path.name, content)
+
+    def _ring_bytes(self) -> int:
+        camera = self._config.camera
+        slot_bytes = FrameLayout(1, 2, "left_cam0", camera.width, camera.height).slot_bytes
+        return len(self._cameras) * self._config.ring_slots * slot_bytes
+
     def _make_folder(self, side: str) -> Path:
         disk: Path = getattr(self._config.disks, side)
         folder = disk / self.flight
@@ -239,7 +266,8 @@ class Recording:
             self._disk.make_folder(folder)
         except OSError as error:
             raise DiskError(
-                f"{disk}: cannot be written ({error.strerror}): mount the disk, or correct `disks.{side}`"
+                f"{disk}: cannot be written ({error.strerror}): mount the disk or make this folder, "
+                f"or correct `disks.{side}`"
             ) from error
         return folder
 
@@ -251,10 +279,11 @@ class Recording:
             if now_s >= next_report_s:
                 next_report_s += DIAGNOSTICS_PERIOD_S
                 self._report()
-            triggers = self._triggers_so_far()
-            if stop.triggers and triggers >= stop.triggers:
+            if stop.triggers and self._triggers_so_far() >= stop.triggers:
                 return
             if stop.duration_s and now_s - started_s >= stop.duration_s:
+                return
+            if now_s - self._last_pulse_s(started_s) > self._silence_s and self._board_has_stopped(board, stop):
                 return
             if board.error is not None:
                 self._failures.append(str(board.error))
@@ -264,6 +293,29 @@ class Recording:
             if not any(grabber.running for grabber in self._grabbers.values()):
                 return
 
+    @property
+    def _silence_s(self) -> float:
+        return max(SILENT_BOARD_S, 10 / self._config.trigger.rate_hz)
+
+    def _last_pulse_s(self, started_s: float) -> float:
+        return max(started_s, self._pulse_s)
+
+    def _board_has_stopped(self, board: TriggerBoard, stop: StopRule) -> bool:
+        """Ask a board that has been silent for long. One that has given all it was asked for is in order."""
+        self._pulse_s = self._clock.monotonic_s()
+        try:
+            running, count = board.status()
+        except TriggerBoardError as error:
+            self._failures.append(str(error))
+            return True
+        self._ledger.triggered(count.next_index)  # also those whose reports were lost
+        given = count.next_index - self._config.trigger.first_index
+        if stop.triggers and given >= stop.triggers:
+            return True
+        if not running:
+            self._failures.append(f"{board.port}: the trigger board has stopped by itself after {given} triggers")
+        return not running
+
     def _end_triggers(self, board: TriggerBoard) -> BoardCount | None:
         try:
             return board.end()
@@ -272,9 +324,11 @@ class Recording:
                 self._failures.append(str(error))
             return None
 
-    def _finish(self, before: BoardCount, count: BoardCount | None, seconds: float) -> RecordingResult:
+    def _finish(
+        self, before: BoardCount, count: BoardCount | None, seconds: float, board: TriggerBoard
+    ) -> RecordingResult:
         first_index = self._config.trigger.first_index
-        next_index = count.next_index if count else first_index + self._triggers_so_far()
+        next_index = count.next_index if count else self._ledger.next_index
         deadline_s = self._clock.monotonic_s() + DRAIN_DEADLINE_S
         while self._clock.monotonic_s() < deadline_s and not all(
             self._ledger.complete(place, next_index) or not grabber.running for place, grabber in self._grabbers.items()
@@ -285,6 +339,7 @@ class Recording:
                 self._failures.append(f"{'/'.join(place)}: its read thread hangs in the camera driver")
             if grabber.error is not None:
                 self._failures.append(str(grabber.error))
+        next_index = next_index if count else self._ledger.next_index
         self._ledger.close(next_index)
         self._report()
         self._flush_aux()
@@ -311,8 +366,11 @@ class Recording:
                 self._failures.append(f"{recorder.moved}; {recorder.side} went on in {recorder.folder}")
             if recorder.failure is not None:
                 self._failures.append(str(recorder.failure))
+        for place, account in self._ledger.accounts().items():
+            if not account.balanced:
+                self._failures.append(f"{'/'.join(place)}: the books do not balance: {account}")
         self._write_metadata()
-        return self._result(next_index - first_index, seconds)
+        return self._result(next_index - first_index, seconds, board.garbled_lines)
 
     def _write_metadata(self) -> None:
         writers = [writer for r in self._recorders.values() for writer in (*r.segments, r.aux)]
@@ -321,7 +379,7 @@ class Recording:
             with contextlib.suppress(OSError):  # a disk that has failed; its files are readable without
                 self._disk.write_text(folder / "metadata.yaml", metadata_yaml(here))
 
-    def _result(self, triggers: int, seconds: float) -> RecordingResult:
+    def _result(self, triggers: int, seconds: float, garbled_lines: int) -> RecordingResult:
         return RecordingResult(
             flight=self.flight,
             folders=[recorder.aux.path.parent for recorder in self._recorders.values()],
@@ -332,6 +390,9 @@ class Recording:
             ring_slots=self._config.ring_slots,
             ring_locked=all(grabber.ring.locked for grabber in self._grabbers.values()),
             seconds=seconds,
+            discarded={place: grabber.discarded for place, grabber in self._grabbers.items()},
+            garbled_lines=garbled_lines,
+            aux_dropped=sum(recorder.aux_dropped for recorder in self._recorders.values()),
             failures=self._failures,
         )
 

@@ -44,10 +44,10 @@ class Disk(Protocol):
     """Where a side's files go."""
 
     def make_folder(self, folder: Path) -> None:
-        """Make a new folder. Raises ``UsageError`` when it exists, ``OSError`` when the disk refuses."""
+        """Make a new folder in an existing one. ``UsageError`` when it exists, ``OSError`` when the disk refuses."""
 
     def create(self, path: Path, mode: str, preallocate_bytes: int) -> DiskFile:
-        """A new file.
+        """A new file, for which space is taken ``preallocate_bytes`` at a time (0: as it comes).
 
         ``mode`` is ``direct``, ``buffered`` (page cache, write-back bounded), ``auto`` (direct where the file system
         can), or ``plain`` (page cache, as it comes: for comparison).
@@ -67,7 +67,7 @@ class SystemDisk:
         """Make a new folder; recordings are never written over."""
         if folder.exists():
             raise UsageError(f"{folder}: exists already and is not written over: choose another flight name")
-        folder.mkdir(parents=True)
+        folder.mkdir()  # not its parents: a disk that is not mounted must not be recorded beside
 
     def create(self, path: Path, mode: str, preallocate_bytes: int) -> DiskFile:
         """A new file. Preallocation is asked for, not demanded: not every file system can."""
@@ -85,8 +85,7 @@ class SystemDisk:
                     raise
                 path.unlink(missing_ok=True)
                 file = BufferedFile(os.open(path, flags, 0o644))
-        if preallocate_bytes:
-            _LIBC.fallocate(file.descriptor, _KEEP_SIZE, ctypes.c_long(0), ctypes.c_long(preallocate_bytes))
+        file.preallocate_bytes = preallocate_bytes
         return file
 
     def free_bytes(self, folder: Path) -> int:
@@ -111,10 +110,16 @@ class PlainFile:
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
+        self.preallocate_bytes = 0
         self._size = 0
+        self._allocated = 0
 
     def write(self, data: memoryview) -> int:
         """Append."""
+        if self.preallocate_bytes and self._size + len(data) > self._allocated:
+            length = max(self.preallocate_bytes, len(data))
+            _LIBC.fallocate(self.descriptor, _KEEP_SIZE, ctypes.c_long(self._allocated), ctypes.c_long(length))
+            self._allocated += length
         done = os.write(self.descriptor, data)
         self._size += done
         return done

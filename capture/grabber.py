@@ -1,7 +1,6 @@
 """The read thread of one camera: filled buffers to numbered, sealed frames in the write queue."""
 
 import threading
-from dataclasses import dataclass
 
 from capture.camera.base import Camera, CameraDescription, FrameStatus, Grab
 from capture.config import DRIVER_BUFFERS
@@ -20,33 +19,39 @@ GRAB_TIMEOUT_S = 0.1
 class SideGate:
     """Keeps stereo sets whole: the first camera of a side to get a trigger's frame decides for both.
 
-    A set is let in when every ring of the side has a slot to spare; otherwise both frames are lost at the ring.
+    A set is let in when every ring of the side has a slot that is not promised yet; one is then promised to each
+    camera. Otherwise both frames are lost at the ring. A promise ends when its camera takes the slot, or shows a later
+    frame.
     """
 
     _REMEMBERED = 64
 
     def __init__(self, rings: list[Ring]) -> None:
         self._rings = rings
+        self._promised: dict[int, set[int]] = {id(ring): set() for ring in rings}
         self._decisions: dict[int, bool] = {}
         self._mutex = threading.Lock()
 
-    def admits(self, index: int) -> bool:
-        """Whether the frames of this trigger are kept."""
+    def take(self, index: int, ring: Ring) -> int | None:
+        """A fresh slot of ``ring`` for the driver, in exchange for this trigger's frame; None: the frame is lost."""
         with self._mutex:
+            promised = self._promised[id(ring)]
+            promised -= {old for old in promised if old < index}
             if index not in self._decisions:
-                self._decisions[index] = all(ring.free > 0 for ring in self._rings)
-                while len(self._decisions) > self._REMEMBERED:
-                    del self._decisions[next(iter(self._decisions))]
-            return self._decisions[index]
+                self._decide(index)
+            if not self._decisions[index]:
+                return None
+            promised.discard(index)
+            return ring.take()
 
-
-@dataclass
-class GrabCounts:
-    """What the read thread has seen."""
-
-    grabbed: int = 0
-    incomplete: int = 0
-    duplicates: int = 0
+    def _decide(self, index: int) -> None:
+        room = all(ring.free > len(self._promised[id(ring)]) for ring in self._rings)
+        self._decisions[index] = room
+        if room:
+            for promised in self._promised.values():
+                promised.add(index)
+        while len(self._decisions) > self._REMEMBERED:
+            del self._decisions[next(iter(self._decisions))]
 
 
 class Grabber(Worker):
@@ -67,7 +72,7 @@ class Grabber(Worker):
         super().__init__(f"read-{place[0]}-{place[1]}")
         self.place = place
         self.ring = ring
-        self.counts = GrabCounts()
+        self.discarded = 0  # duplicates, and frames that no trigger asked for
         self._camera = camera
         self._description = description
         self._layout = layout
@@ -104,7 +109,6 @@ class Grabber(Worker):
         grab = self._camera.grab(timeout_s)
         if grab is None:
             return False
-        self.counts.grabbed += 1
         for told, numbered in self._numbering.feed(grab):
             self._take(told, numbered)
         return True
@@ -116,14 +120,13 @@ class Grabber(Worker):
 
     def _take(self, grab: Grab, numbered: Numbered | None) -> None:
         if numbered is None or not self._ledger.arrived(self.place, numbered.index, numbered.lost_in_delivery):
-            self.counts.duplicates += 1
+            self.discarded += 1
             self._queue(grab.slot)
             return
         if grab.status is not FrameStatus.COMPLETE:
-            self.counts.incomplete += 1
             self._lose(grab, numbered, LossStage.USB, "the driver delivered an incomplete buffer")
             return
-        fresh = self.ring.take() if self._gate.admits(numbered.index) else None
+        fresh = self._gate.take(numbered.index, self.ring)
         if fresh is None:
             self._lose(grab, numbered, LossStage.RING, "ring full: the disk is behind by more than ring.stall_s")
             return

@@ -29,7 +29,7 @@ class LaneParts:
     clock: Clock
     ring_slots: int
     lock_memory: bool
-    calibration: Path | None = None
+    calibration: tuple[str, bytes] | None = None  # name and content
 
 
 @dataclass(frozen=True)

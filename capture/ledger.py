@@ -118,6 +118,12 @@ class Ledger:
             for index in left:
                 self._book(place, index, LossStage.WRITER, cause)
 
+    @property
+    def next_index(self) -> int:
+        """One past the last trigger that the board reported, or that a frame has shown."""
+        with self._mutex:
+            return max(self._next_index, *(account.next_index for account in self._accounts.values()))
+
     def complete(self, place: Place, next_index: int) -> bool:
         """Whether every trigger below ``next_index`` has been decided upon for this camera."""
         return self._accounts[place].next_index >= next_index

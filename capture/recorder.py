@@ -32,7 +32,7 @@ AUX_CHANNELS = (
 )
 AUX_QUEUE = 1024
 SYNC_PERIOD_S = 0.5  # what a power cut may take with it, while the disk keeps up
-PREALLOCATE_BYTES = 4e9
+PREALLOCATE_BYTES = 128e6  # at a time: little of it is left behind by a kill, or missing from the reserve
 _SPACE_CHECK_EVERY = 32  # frames
 
 
@@ -92,7 +92,7 @@ class Recorder(Worker):
         ledger: Ledger,
         clock: Clock,
         queue_bound: int,
-        calibration: Path | None = None,
+        calibration: tuple[str, bytes] | None = None,
         spare: tuple[Disk, Path] | None = None,
     ) -> None:
         super().__init__(f"write-{side}")
@@ -240,7 +240,7 @@ class Recorder(Worker):
         self.write_mode = segment.write_mode
         now_ns = self._clock.utc_ns()
         if self._calibration is not None:
-            segment.attach(self._calibration, now_ns)
+            segment.attach(*self._calibration, now_ns)
         height, width = self._size
         segment.write_batch(
             [

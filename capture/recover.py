@@ -98,6 +98,8 @@ def _copy_segment(disk: SystemDisk, path: Path, copy: Path) -> SegmentWriter | N
         if writer is None:  # provenance and channels stand before the first chunk
             channels = [Channel(number, topic, found.types[topic]) for number, topic in sorted(found.topics.items())]
             writer = SegmentWriter(disk, copy, channels, _provenance(found.provenance, path), "buffered")
+            for name, data in found.attachments:
+                writer.attach(name, data, batch[0].log_ns)
         numbers = {topic: number for number, topic in found.topics.items()}
         writer.write_batch([_small(message, numbers[message.topic]) for message in batch if message.topic in numbers])
     if writer is not None:
@@ -116,7 +118,7 @@ def _copy_aux(disk: SystemDisk, folder: Path, copy: Path, report: FlightReport, 
         except RecordingError:
             continue
         for _, group in itertools.groupby(messages, key=lambda message: message.chunk_at):
-            batches.append([_small(m, numbers[m.topic], bytes(m.data)) for m in group if m.topic in numbers])
+            batches.append([_small(m, numbers[m.topic]) for m in group if m.topic in numbers and not _back(m, report)])
         provenance = found.provenance or provenance
     writer = SegmentWriter(disk, copy / "aux_0000.mcap", AUX_CHANNELS, _provenance(provenance, folder), "buffered")
     for batch in batches:
@@ -143,6 +145,14 @@ def _provenance(original: dict[str, str], path: Path) -> dict[str, str]:
     return {**original, "recovered_from": str(path), "write_mode": "buffered"}
 
 
-def _small(message: ScannedMessage, channel: int, data: bytes | memoryview | None = None) -> SmallMessage:
-    content = bytes(message.data) if data is None else bytes(data)
-    return SmallMessage(channel, message.sequence, message.log_ns, message.publish_ns, content)
+def _back(message: ScannedMessage, report: FlightReport) -> bool:
+    """Whether this is the loss record of a frame that is on the disk after all."""
+    if message.topic != LOSS_TOPIC:
+        return False
+    loss = Loss.decode(message.data)
+    camera = report.cameras.get(f"{loss.side}/{loss.camera}")
+    return camera is not None and loss.trigger_index in camera.indices
+
+
+def _small(message: ScannedMessage, channel: int) -> SmallMessage:
+    return SmallMessage(channel, message.sequence, message.log_ns, message.publish_ns, bytes(message.data))

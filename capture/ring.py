@@ -4,6 +4,9 @@ import ctypes
 import mmap
 import threading
 from collections import deque
+from pathlib import Path
+
+from capture.errors import UsageError
 
 PAGE = mmap.PAGESIZE
 
@@ -55,6 +58,24 @@ class Ring:
     def in_use(self) -> int:
         """How many slots are not free now, the driver's included."""
         return self.slots - len(self._free)
+
+
+def check_memory(need_bytes: int) -> None:
+    """Refuse to allocate what is not there, before the system kills somebody for it.
+
+    Raises:
+        UsageError: more than the memory that is available; the message has both figures.
+    """
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free_bytes = next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return
+    if need_bytes > free_bytes:
+        raise UsageError(
+            f"the rings need {need_bytes / 1e9:.1f} GB, {free_bytes / 1e9:.1f} GB of memory are available: "
+            "lower ring.stall_s, the rate or the image size"
+        )
 
 
 def _lock(memory: mmap.mmap) -> bool:

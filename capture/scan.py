@@ -48,6 +48,7 @@ class Scan:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     topics: dict[int, str] = field(default_factory=dict)  # by channel id
     types: dict[str, str] = field(default_factory=dict)  # by topic
+    attachments: list[tuple[str, bytes]] = field(default_factory=list)
     schemas: dict[int, str] = field(default_factory=dict)
     chunks: int = 0
     closed: bool = False  # has DataEnd, summary and footer
@@ -81,11 +82,13 @@ def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
     while at + _RECORD.size <= found.size:
         opcode, length = _RECORD.unpack_from(data, at)
         end = at + _RECORD.size + length
-        if opcode == 0 or end > found.size or opcode not in _KNOWN:
-            after = _next_chunk(data, at)
+        known = opcode in _KNOWN and end <= found.size
+        if not known or _is_damaged(found, opcode, data[at + _RECORD.size : end], at, index):
+            after = _next_chunk(data, at)  # the length of a damaged record is not to be believed
             if after is None:
                 break
-            found.problems.append(f"bytes {at} to {after} are damaged: a hole")
+            if not known:
+                found.problems.append(f"bytes {at} to {after} are damaged: a hole")
             at, open_from = after, None
             continue
         body = data[at + _RECORD.size : end]
@@ -95,10 +98,6 @@ def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
         if opcode == Opcode.CHUNK:
             index = {}
             yield from _chunk(found, body, at, index)
-        elif opcode == Opcode.MESSAGE_INDEX:
-            _check_index(found, body, at, index)
-        elif opcode == PADDING_OPCODE:
-            _demand(found, at, not any(body), "padding that is not empty")
         elif opcode == GUARD_OPCODE:
             covered_from, crc = GUARD.unpack(body) if length == GUARD.size else (None, 0)
             good = covered_from == open_from and covered_from is not None and zlib.crc32(data[covered_from:at]) == crc
@@ -108,13 +107,36 @@ def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
             _demand(found, at, body == bytes(4), "a closing record that was altered")
             found.closed = _check_summary(found, data, end)
             return
-        else:
+        elif opcode not in (Opcode.MESSAGE_INDEX, PADDING_OPCODE):
             open_from = at if open_from is None else open_from
             _take_record(found, opcode, body, at)
         at = end
     found.problems.append(
         f"ends at byte {at} of {found.size} without its closing records: it was not closed, or was cut"
     )
+
+
+def _is_damaged(found: Scan, opcode: int, body: memoryview, at: int, index: dict[int, list[tuple[int, int]]]) -> bool:
+    """Whether a chunk, an index or a padding is not what it must be; what is wrong goes to the problems."""
+    wrong = ""
+    if opcode == Opcode.CHUNK:
+        wrong = _what_is_wrong_with_chunk(body)
+    elif opcode == Opcode.MESSAGE_INDEX and not _agrees(body, index):
+        wrong = "a message index that does not agree with its chunk"
+    elif opcode == PADDING_OPCODE and any(body):
+        wrong = "padding that is not empty"
+    _demand(found, at, not wrong, wrong)
+    return bool(wrong)
+
+
+def _what_is_wrong_with_chunk(body: memoryview) -> str:
+    if len(body) <= _CHUNK.size:
+        return "a chunk too short for its own header"
+    _, _, size, crc, compression, stored = _CHUNK.unpack_from(body)
+    content = body[_CHUNK.size :]
+    if compression or size != stored or len(content) != size:
+        return "a chunk whose lengths do not agree"
+    return "" if zlib.crc32(content) == crc else "a chunk whose content differs from its CRC"
 
 
 def _next_chunk(data: memoryview, at: int) -> int | None:
@@ -166,25 +188,19 @@ def _take_record(found: Scan, opcode: int, body: memoryview, at: int) -> None:
         elif opcode == Opcode.SCHEMA:
             schema = records.Schema.read(_stream(body))
             found.schemas[schema.id] = schema.name
-        elif opcode not in (Opcode.HEADER, Opcode.ATTACHMENT):
+        elif opcode == Opcode.ATTACHMENT:
+            attachment = records.Attachment.read(_stream(body))
+            found.attachments.append((attachment.name, attachment.data))
+        elif opcode != Opcode.HEADER:
             found.problems.append(f"byte {at}: a record of kind {opcode:#x} that does not belong here")
     except (McapError, ValueError, struct.error) as error:
         found.problems.append(f"byte {at}: a record that cannot be read ({error})")
 
 
 def _chunk(found: Scan, body: memoryview, at: int, index: dict[int, list[tuple[int, int]]]) -> Iterator[ScannedMessage]:
-    """The messages of a chunk; ``index`` is filled with what its MessageIndex records must say."""
-    if len(body) < _CHUNK.size:
-        found.problems.append(f"byte {at}: a chunk too short for its own header")
-        return
-    first_ns, last_ns, size, crc, compression, stored = _CHUNK.unpack_from(body)
+    """The messages of a good chunk; ``index`` is filled with what its MessageIndex records must say."""
+    first_ns, last_ns, size, *_ = _CHUNK.unpack_from(body)
     content = body[_CHUNK.size :]
-    if compression or size != stored or len(content) != size:
-        found.problems.append(f"byte {at}: a chunk whose lengths do not agree")
-        return
-    if zlib.crc32(content) != crc:
-        found.problems.append(f"byte {at}: a chunk whose content differs from its CRC")
-        return
     found.chunks += 1
     inner = 0
     while inner + _RECORD.size <= size:
@@ -203,15 +219,16 @@ def _chunk(found: Scan, body: memoryview, at: int, index: dict[int, list[tuple[i
             )
         inner = start + length
     times = [log_ns for entries in index.values() for log_ns, _ in entries]
-    _demand(found, at, (min(times), max(times)) == (first_ns, last_ns), "a chunk whose header has the wrong times")
+    agree = bool(times) and (min(times), max(times)) == (first_ns, last_ns)
+    _demand(found, at, agree, "a chunk whose header has the wrong times")
 
 
-def _check_index(found: Scan, body: memoryview, at: int, index: dict[int, list[tuple[int, int]]]) -> None:
+def _agrees(body: memoryview, index: dict[int, list[tuple[int, int]]]) -> bool:
+    """Whether a MessageIndex says what its chunk holds."""
     count = max(0, len(body) - 6) // 16
     channel, size = struct.unpack_from("<HI", body) if len(body) >= 6 else (0, 0)
     entries = [struct.unpack_from("<QQ", body, 6 + 16 * k) for k in range(count)]
-    good = size == 16 * count and len(body) == 6 + size and entries == index.get(channel)
-    _demand(found, at, good, "a message index that does not agree with its chunk")
+    return size == 16 * count and len(body) == 6 + size and entries == index.get(channel)
 
 
 def _check_summary(found: Scan, data: memoryview, at: int) -> bool:

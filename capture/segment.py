@@ -237,11 +237,11 @@ class SegmentWriter:
         self._metadata_indexes.append(records.MetadataIndex(self.bytes_written, len(block), name))
         self._write_block(block + self._guard(block))
 
-    def attach(self, path: Path, log_ns: int) -> None:
+    def attach(self, name: str, data: bytes, log_ns: int) -> None:
         """Carry a small file along (a calibration)."""
         out = RecordBuilder()
         attachment = records.Attachment(
-            create_time=log_ns, log_time=log_ns, name=path.name, media_type="application/json", data=path.read_bytes()
+            create_time=log_ns, log_time=log_ns, name=name, media_type="application/json", data=data
         )
         attachment.write(out)
         block = out.end()
@@ -252,7 +252,7 @@ class SegmentWriter:
                 log_time=log_ns,
                 create_time=log_ns,
                 data_size=len(attachment.data),
-                name=path.name,
+                name=name,
                 media_type="application/json",
             )
         )
@@ -345,6 +345,8 @@ class SegmentWriter:
             while done < len(view):  # a short write: what comes of the rest says why
                 done += file.write(view[done:])
         except OSError as error:
+            with contextlib.suppress(OSError):  # leave no torn record behind, where the disk still can
+                file.cut(self.bytes_written)
             raise self._disk_error(error) from error
         self.bytes_written += len(view)
 

@@ -14,7 +14,7 @@ from capture.record import Trigger
 from capture.trigger_protocol import PROTOCOL_VERSION, GarbledLine, Pulse, decode_line, encode_line, parse_pulse
 from capture.worker import Worker
 
-REPLY_TIMEOUT_S = 2.0
+REPLY_TIMEOUT_S = 1.0
 _PULSES_KEPT = 4096
 
 
@@ -93,10 +93,11 @@ class TriggerBoard(Worker):
         self._on_pulse = on_pulse
         self._replies: queue.SimpleQueue[tuple[str, ...]] = queue.SimpleQueue()
         try:
-            self._serial = serial.Serial(port, baudrate=115200, timeout=0.1, write_timeout=1.0)
+            self._serial = serial.Serial(port, baudrate=115200, timeout=0.1, write_timeout=1.0, exclusive=True)
         except (serial.SerialException, OSError) as error:
             raise TriggerBoardError(
-                f"{port}: the trigger board's port cannot be opened ({error}): check `trigger.port` and the cable"
+                f"{port}: the trigger board's port cannot be opened ({error}): check `trigger.port`, the cable, "
+                "and that no other recorder is running"
             ) from error
 
     def hello(self) -> str:
@@ -114,12 +115,19 @@ class TriggerBoard(Worker):
 
     def begin(self, first_index: int, count: int = 0) -> None:
         """Give pulses from ``first_index`` on; ``count`` of them, or without end."""
-        self._ask("START", str(first_index), str(count))
+        words = ("START", str(first_index), str(count))
+        if self._ask_once(words) is None and not self.status()[0]:  # START itself must not be repeated
+            raise TriggerBoardError(f"{self.port}: the trigger board does not start: check that it is powered")
 
     def end(self) -> BoardCount:
         """No pulse after this returns."""
         words = self._ask("STOP")
         return self._count(words)
+
+    def status(self) -> tuple[bool, BoardCount]:
+        """Whether the board is running, and its counts."""
+        words = self._ask("STATUS")
+        return words[:1] == ("1",), self._count(words[1:])
 
     def close(self) -> None:
         """Let go of the port. Safe to call twice."""
@@ -160,6 +168,18 @@ class TriggerBoard(Worker):
             self.garbled_lines += 1
 
     def _ask(self, *words: str) -> tuple[str, ...]:
+        """The answer's words; asked twice, since an answer may be garbled."""
+        reply = self._ask_once(words)
+        if reply is None:
+            reply = self._ask_once(words)
+        if reply is None:
+            raise TriggerBoardError(
+                f"{self.port}: the trigger board did not answer {words[0]} within {2 * REPLY_TIMEOUT_S:g} s: "
+                "check that it is powered and that no other program has its port"
+            )
+        return reply
+
+    def _ask_once(self, words: tuple[str, ...]) -> tuple[str, ...] | None:
         while not self._replies.empty():  # late answers to questions that were given up
             self._replies.get()
         try:
@@ -176,10 +196,7 @@ class TriggerBoard(Worker):
                 return reply[2:]
             if reply[0] == "ERR":
                 raise TriggerBoardError(f"{self.port}: the board refuses {' '.join(words)}: {' '.join(reply[1:])}")
-        raise TriggerBoardError(
-            f"{self.port}: the trigger board did not answer {words[0]} within {REPLY_TIMEOUT_S:g} s: "
-            "check that it is powered and that no other program has its port"
-        )
+        return None
 
     def _count(self, words: tuple[str, ...]) -> BoardCount:
         try:

@@ -1,17 +1,17 @@
 """A flight's folders to a certificate: is every trigger of every camera recorded once, or lost with a cause?"""
 
+import contextlib
+import struct
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from capture.errors import RecordingError
+from capture.errors import RecordingError, UsageError
 from capture.flight import find_folders
 from capture.record import LOSS_TOPIC, SIDES, TRIGGER_TOPIC, Frame, Loss, Trigger, decode_image
 from capture.scan import Scan, ScannedMessage, scan
-
-_PROBLEMS_KEPT = 100
 
 
 @dataclass
@@ -115,8 +115,10 @@ def inspect(paths: Sequence[Path]) -> FlightReport:
 
     Raises:
         RecordingError: there is nothing to read.
+        UsageError: the folders hold more than one flight.
     """
     report = FlightReport(find_folders(paths))
+    _demand_one_flight(report.folders)
     pulses: dict[int, Trigger] = {}
     ends: list[dict[str, str]] = []
     for folder in report.folders:
@@ -133,9 +135,8 @@ def inspect(paths: Sequence[Path]) -> FlightReport:
             if "wingshape_end" in found.metadata:
                 ends.append(found.metadata["wingshape_end"])
             report.provenance = report.provenance or found.provenance
-    _check_one_flight(report)
+    _check_sides(report)
     _check_books(report, pulses, ends)
-    del report.problems[_PROBLEMS_KEPT:]
     return report
 
 
@@ -162,7 +163,7 @@ def _take(report: FlightReport, path: Path, message: ScannedMessage, pulses: dic
                 report.problems.append(
                     f"{path}: {message.topic} trigger {message.sequence}: Frame and Message disagree"
                 )
-    except ValueError as error:
+    except (ValueError, struct.error) as error:
         report.problems.append(f"{path}: {message.topic} sequence {message.sequence} cannot be decoded: {error}")
 
 
@@ -170,10 +171,20 @@ def _camera(report: FlightReport, side: str, name: str) -> CameraReport:
     return report.cameras.setdefault(f"{side}/{name}", CameraReport())
 
 
-def _check_one_flight(report: FlightReport) -> None:
-    flights = {file.provenance.get("flight_id", "?") for file in report.files}
+def _demand_one_flight(folders: Sequence[Path]) -> None:
+    flights: dict[str, Path] = {}
+    for path in (path for folder in folders for path in sorted(folder.glob("*.mcap"))):
+        with contextlib.suppress(RecordingError):
+            found, messages = scan(path)
+            next(messages, None)  # the provenance stands before the first message
+            if "flight_id" in found.provenance:
+                flights.setdefault(found.provenance["flight_id"], path.parent)
     if len(flights) > 1:
-        report.problems.append(f"the folders hold {len(flights)} different flights: give those of one flight")
+        where = ", ".join(str(folder) for folder in flights.values())
+        raise UsageError(f"these folders hold {len(flights)} different flights ({where}): name those of one flight")
+
+
+def _check_sides(report: FlightReport) -> None:
     expected = set(report.provenance.get("cameras", "").split())
     for name in sorted(expected):
         if name.split("/")[0] not in report.sides:

@@ -36,20 +36,21 @@ SQUARE_MM = "30"
 
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="folder for everything; an earlier demo in it is replaced")],
-    seconds: Annotated[float, typer.Option(min=1.0, help="length of the flight")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="length of the flight")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="everything random follows from it")] = 1,
-    scale: Annotated[int, typer.Option(help="divides the image size: 1 is full size, 4 is quick")] = 1,
+    scale: Annotated[int, typer.Option(min=1, max=8, help="divides the image size: 1, 2, 4 (quick) or 8")] = 1,
     json_output: Annotated[bool, typer.Option("--json", help="print the summary as JSON too")] = False,
 ) -> None:
     """A simulated flight: calibrate, record in real time, reconstruct, compare with the truth."""
     started_s = time.monotonic()
+    world = World.make(seed, scale)
+    triggers = round(seconds * world.trigger_rate_hz)
     _clear(out)
-    with tempfile.TemporaryDirectory(prefix="wingsim-") as private:
+    _check_space(out, world, triggers)
+    with tempfile.TemporaryDirectory(prefix="wingsim-", dir=_short_folder()) as private:
         hidden = Path(private)
         steps = Steps(out)
-        world = _prepare(steps, hidden, seed, scale)
-        triggers = round(seconds * world.trigger_rate_hz)
-        _check_space(out, world, triggers)
+        _prepare(steps, hidden, seed, scale)
         _record(steps, hidden, world, triggers)
         _measure(steps)
         shutil.move(hidden / "truth", out / "truth")
@@ -104,6 +105,11 @@ def _clear(out: Path) -> None:
     (out / _MARK).touch()
 
 
+def _short_folder() -> str | None:
+    """A socket's path may not be longer than about 100 bytes; some temporary folders are."""
+    return "/tmp" if len(tempfile.gettempdir()) > 60 and os.access("/tmp", os.W_OK) else None
+
+
 def _check_space(out: Path, world: World, triggers: int) -> None:
     need = 1.1 * triggers * len(world.cameras) * world.sensor.width_px * world.sensor.height_px + 1e9
     free = shutil.disk_usage(out).free
@@ -113,7 +119,7 @@ def _check_space(out: Path, world: World, triggers: int) -> None:
         )
 
 
-def _prepare(steps: Steps, hidden: Path, seed: int, scale: int) -> World:
+def _prepare(steps: Steps, hidden: Path, seed: int, scale: int) -> None:
     """What happens before the flight: the world, the calibration day, the rig's and the wing's files."""
     world_path = hidden / "world.toml"
     steps.run("wingsim", "world", "-o", str(world_path), "--seed", str(seed), "--scale", str(scale))
@@ -129,13 +135,14 @@ def _prepare(steps: Steps, hidden: Path, seed: int, scale: int) -> World:
         "-o", "ground/rig.json",
     )  # fmt: skip
     steps.run("reconstruct", "example", "xhale", "-o", "ground/wing.toml")
-    return World.read(world_path)
 
 
 def _record(steps: Steps, hidden: Path, world: World, triggers: int) -> None:
     socket, port = hidden / "rig.sock", hidden / "trigger"
     config = steps.folder / "wingcap.toml"
     config.write_text(recorder_config(world, socket, port), encoding="utf-8")
+    for side in SIDES:
+        (steps.folder / f"ssd_{side}").mkdir()
     with _hardware(hidden / "world.toml", socket, port, hidden / "truth"):
         steps.run("wingcap", "record", "--config", "wingcap.toml", "--triggers", str(triggers))
     steps.run("wingcap", "verify", "ssd_left/demo", "ssd_right/demo")
@@ -215,7 +222,8 @@ def _await_ready(process: subprocess.Popen[str]) -> None:
         if "ready" in (process.stdout.readline() or ""):
             return
         time.sleep(0.02)
-    raise SimulationError(f"the simulated hardware was not ready within {RIG_READY_S:g} s: see its message above")
+    how = "ended at once" if process.poll() is not None else f"was not ready within {RIG_READY_S:g} s"
+    raise SimulationError(f"the simulated hardware {how}: see its message above")
 
 
 def _summary(out: Path, started_s: float, flight_s: float) -> dict[str, Any]:

@@ -44,6 +44,8 @@ class FakeRig:
     silent_pulses: set[int] = field(default_factory=set)  # the board does not report them
     garbled_pulses: set[int] = field(default_factory=set)
     cameras: dict[str, "FakeCamera"] = field(default_factory=dict)
+    board: "FakeBoard | None" = None
+    pulse_before_stop: bool = False
     rate_hz: float = 25.0
     counter: int = 17
 
@@ -118,7 +120,7 @@ class FakeBoard:
         rig.port = os.ttyname(self.slave)
         self.rig = rig
         self.running = False
-        self.next_index = 0
+        self.next_index, self.last = 0, 1 << 60
         self._stop = threading.Event()
         self._mutex = threading.Lock()
         self.threads = [threading.Thread(target=self._listen), threading.Thread(target=self._pulse)]
@@ -159,6 +161,9 @@ class FakeBoard:
                 self.running = True
             elif words[0] == "STOP":
                 self.running = False
+                if self.rig.pulse_before_stop:  # one was on the line when STOP came
+                    self.rig.pulse_before_stop = False
+                    self._say(*Pulse(self.next_index, self.rig.counter, time.time_ns(), time.time_ns()).words())
                 self._say("OK", "STOP", self.next_index, self.rig.counter)
             else:
                 self._say("OK", "STATUS", int(self.running), self.next_index, self.rig.counter)
@@ -166,7 +171,8 @@ class FakeBoard:
     def _pulse(self) -> None:
         while not self._stop.wait(1 / self.rig.rate_hz):
             with self._mutex:
-                if not self.running or self.next_index >= self.last:
+                self.running = self.running and self.next_index < self.last
+                if not self.running:
                     continue
                 now_ns = time.time_ns()
                 index = self.next_index
@@ -188,6 +194,7 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeRig]:
     module.FakeCamera = type("FakeCamera", (FakeCamera,), {"rig": rig})
     monkeypatch.setitem(sys.modules, "fake_camera_backend", module)
     monkeypatch.setitem(capture.camera.BACKENDS, "fake", ("fake_camera_backend", "FakeCamera"))
+    rig.board = board
     yield rig
     board.close()
 
@@ -203,6 +210,8 @@ def write_config(tmp_path: Path, rig: FakeRig) -> Callable[..., Path]:
             for name in ("cam0", "cam1")
         )
         path = tmp_path / "wingcap.toml"
+        for disk_folder in ("ssd_left", "ssd_right"):
+            (tmp_path / disk_folder).mkdir(exist_ok=True)
         path.write_text(
             f'flight = "test"\n{top}\n'
             f'[trigger]\nport = "{rig.port}"\nrate_hz = {rate_hz}\n'

@@ -1,9 +1,14 @@
 """A configuration that cannot be used is refused in one line that names the file and the key."""
 
+import threading
+
 import pytest
 
+from capture.clock import SystemClock
 from capture.config import DRIVER_BUFFERS, load_config
-from capture.errors import ConfigError
+from capture.daemon import Recording, StopRule
+from capture.disk import SystemDisk
+from capture.errors import ConfigError, DiskError, UsageError
 
 
 def test_defaults_and_relative_paths(write_config, tmp_path):
@@ -24,6 +29,8 @@ def test_defaults_and_relative_paths(write_config, tmp_path):
         ("[trigger]", "[trigger", "not a TOML file"),
         ('flight = "test"', 'flight = "../up"', "`flight`"),
         ('flight = "test"', 'calibration = "rig.json"', "the calibration named in"),
+        ('right = "ssd_right"', 'right = "./ssd_left"', "are the same folder"),
+        ("rate_hz = 100.0", "first_index = 4294967290", "`trigger.first_index`"),
     ],
 )
 def test_refusals(write_config, wingcap, old, new, says):
@@ -47,3 +54,18 @@ def test_a_missing_file(tmp_path, wingcap):
     assert answer.stderr.count("\n") == 1
     assert wingcap("record").returncode == 2
     assert wingcap("nonsense").returncode == 2
+
+
+def test_rings_that_do_not_fit_into_memory_are_refused_before_they_are_touched(write_config, wingcap):
+    path = write_config(rate_hz=200)
+    text = path.read_text().replace("stall_s = 0.5", "stall_s = 60").replace("width = 64", "width = 16000")
+    path.write_text(text.replace("height = 48", "height = 16000"))
+    with pytest.raises(UsageError, match=r"the rings need \d+\.\d GB"):
+        Recording(load_config(path), SystemClock(), SystemDisk(), lambda _: None).run(StopRule(threading.Event()))
+
+
+def test_a_disk_that_is_not_mounted_is_not_recorded_beside(write_config, tmp_path):
+    path = write_config()
+    (tmp_path / "ssd_right").rmdir()
+    with pytest.raises(DiskError, match=r"ssd_right.*mount the disk or make this folder"):
+        Recording(load_config(path), SystemClock(), SystemDisk(), lambda _: None).run(StopRule(threading.Event()))

@@ -37,8 +37,11 @@ def hardware(tmp_path) -> Path:
         for side, name in itertools.product(("left", "right"), ("cam0", "cam1"))
     )
     config = tmp_path / "wingcap.toml"
+    for side in ("left", "right"):
+        (tmp_path / f"ssd_{side}").mkdir()
     config.write_text(
-        '[trigger]\nport = "trigger"\n[disks]\nleft = "ssd_left"\nright = "ssd_right"\nsegment_s = 0.7\n'
+        '[trigger]\nport = "trigger"\n'
+        '[disks]\nleft = "ssd_left"\nright = "ssd_right"\nsegment_s = 0.7\nsegment_mb = 20\n'
         f'[camera]\nbackend = "simulated"\nwidth = 260\nheight = 194\n{cameras}'
     )
     yield config

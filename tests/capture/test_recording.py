@@ -17,6 +17,7 @@ from capture.daemon import Recording, RecordingResult, StopRule
 from capture.disk import SystemDisk
 from capture.errors import CameraError, TriggerBoardError, UsageError
 from capture.recover import recover_flight
+from capture.trigger import TriggerBoard
 from capture.verify import inspect
 
 TRIGGERS = 25
@@ -132,8 +133,7 @@ def test_a_full_disk_ends_its_side_only(write_config, rig, tmp_path, monkeypatch
     assert "free" in result.failures[0]
 
 
-def test_the_other_disk_takes_over_where_configured(write_config, rig, tmp_path, pixels_of):
-    monkeypatch = pytest.MonkeyPatch()
+def test_the_other_disk_takes_over_where_configured(write_config, rig, tmp_path, monkeypatch, pixels_of):
     real, writes = SystemDisk.create, []
 
     def create(self, path, mode, preallocate_bytes):
@@ -219,3 +219,69 @@ def test_a_missing_board_is_one_line(write_config, rig):
     config.write_text(config.read_text().replace(rig.port, "/dev/no-such-port"))
     with pytest.raises(TriggerBoardError, match="/dev/no-such-port"):
         record(config)
+
+
+def test_pulses_of_the_recording_before_are_not_ours(write_config, rig, tmp_path):
+    """A board that still runs for a recorder that was killed, far ahead in its index."""
+    rig.board.next_index = 5000
+    rig.pulse_before_stop = True
+    result = record(write_config())
+    assert (result.triggers, result.recorded, result.lost, result.failures) == (TRIGGERS, 4 * TRIGGERS, 0, [])
+    assert inspect([tmp_path]).problems == []
+
+
+def test_a_last_pulse_that_is_not_reported_does_not_keep_us_waiting(write_config, rig, tmp_path):
+    rig.silent_pulses = {TRIGGERS - 1}
+    result = record(write_config())
+    assert (result.triggers, result.recorded, result.lost, result.failures) == (TRIGGERS, 4 * TRIGGERS, 0, [])
+    assert len(inspect([tmp_path]).notes) == 1
+
+
+def test_a_board_that_stops_by_itself_is_said_and_everything_is_closed(write_config, rig, tmp_path):
+    threading.Timer(1.5, lambda: setattr(rig.board, "running", False)).start()
+    result = record(write_config(), triggers=1000)
+    assert "stopped by itself" in result.failures[0]
+    assert result.lost == 0
+    assert inspect([tmp_path]).problems == []
+
+
+def test_the_board_serves_one_recorder_at_a_time(rig):
+    first = TriggerBoard(rig.port, SystemClock(), lambda pulse, trigger: None)
+    try:
+        with pytest.raises(TriggerBoardError, match="no other recorder"):
+            TriggerBoard(rig.port, SystemClock(), lambda pulse, trigger: None)
+    finally:
+        first.close()
+
+
+def test_whatever_goes_wrong_in_flight_the_files_are_closed(write_config, rig, tmp_path):
+    calls = []
+
+    def progress(text: str) -> None:
+        calls.append(text)
+        if len(calls) == 3:
+            raise RuntimeError("a bug")
+
+    config = load_config(write_config())
+    result = Recording(config, SystemClock(), SystemDisk(), progress).run(StopRule(threading.Event(), 1000))
+    assert "a bug" in result.failures[0]
+    assert result.recorded > 0
+    assert inspect([tmp_path]).problems == []
+
+
+def test_every_segment_and_its_recovered_copy_carry_the_calibration(write_config, rig, tmp_path):
+    (tmp_path / "rig.json").write_text('{"format": "any"}')
+    path = write_config(disks="segment_mb = 0.1", top='calibration = "rig.json"')
+    loaded = load_config(path)
+    (tmp_path / "rig.json").unlink()  # what happens to the file in flight does not matter
+    result = Recording(loaded, SystemClock(), SystemDisk(), lambda _: None).run(StopRule(threading.Event(), TRIGGERS))
+    assert (result.recorded, result.failures) == (4 * TRIGGERS, [])
+    recover_flight([tmp_path / "ssd_left", tmp_path / "ssd_right"], tmp_path / "copy")
+    segments = [*tmp_path.glob("ssd_*/test/*_0*.mcap"), *tmp_path.glob("copy/*/*_0*.mcap")]
+    assert len(segments) > 10
+    for segment in segments:
+        if segment.name.startswith("aux"):
+            continue
+        with segment.open("rb") as file:
+            (attachment,) = make_reader(file).iter_attachments()
+        assert (attachment.name, attachment.data) == ("rig.json", b'{"format": "any"}')

@@ -93,3 +93,20 @@ def test_a_copy_is_never_written_over(flight, tmp_path):
     (tmp_path / "copy").mkdir()
     with pytest.raises(UsageError, match="exists already"):
         recover_flight([flight], tmp_path / "copy")
+
+
+@pytest.mark.parametrize("opcode", [0x80, 0x07, 0x06])
+@pytest.mark.parametrize("byte", [1, 2, 3, 8])
+def test_a_flipped_bit_in_a_length_costs_one_frame_at_most(flight, tmp_path, opcode, byte):
+    """The length of a damaged record leads anywhere; the search goes on right behind its first byte."""
+    path = flight / "ssd_left/test/left_0000.mcap"
+    data = bytearray(path.read_bytes())
+    at, records = 8, []
+    while data[at] != 0x0F:
+        records.append((data[at], at))
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    data[[place for kind, place in records if kind == opcode][5] + byte] ^= 1
+    path.write_bytes(data)
+    result = recover_flight([flight / "ssd_left", flight / "ssd_right"], tmp_path / "copy")
+    assert result.frames >= 31
+    assert inspect([tmp_path / "copy"]).problems == []

@@ -44,6 +44,12 @@ RING_SLOTS = DRIVER_BUFFERS + 8
 NOTHING = 1 << 60
 
 
+FAULTS = (
+    "missed", "undelivered", "incomplete", "repeated", "late", "unplugged", "armed late", "unreported", "stall",
+    "long stall", "short write", "full", "EIO", "sync fails", "writer dies", "kill", "power cut",
+)  # fmt: skip
+
+
 class Killed(BaseException):
     """The process or the machine is gone. Not an Exception: nothing may catch it."""
 
@@ -98,38 +104,20 @@ class Plan:
             plan.armed_at[draw.choice(places)] = draw.randint(1, 5)
         if draw.random() < 0.3:
             plan.unreported = set(draw.sample(range(plan.triggers), 2))
-        if draw.random() < 0.6:
+        if draw.random() < 0.8:
             side = draw.choice(SIDES)
             faults_here = plan.disk_faults.setdefault(side, {})
             for _ in range(draw.randint(1, 3)):
                 kind = draw.choice(["stall", "long stall", "short write", "full", "EIO", "sync fails"])
-                faults_here[draw.randint(4, 2 * plan.triggers)] = kind
-        if draw.random() < 0.1:
-            plan.writer_dies_at[draw.choice(SIDES)] = draw.randint(4, 2 * plan.triggers)
+                faults_here[draw.randint(4, plan.triggers)] = kind
+        if draw.random() < 0.15:
+            plan.writer_dies_at[draw.choice(SIDES)] = draw.randint(4, plan.triggers)
         if draw.random() < 0.3:
             plan.end = draw.choice(["kill", "power cut"])
             plan.end_at_write = draw.randint(5, 4 * plan.triggers)
         plan.segment_mb = draw.choice([0.05, 0.1, 1e3])
         plan.takeover = draw.random() < 0.4
         return plan
-
-    def faults(self) -> Counter[str]:
-        """How often each fault is planned."""
-        count: Counter[str] = Counter(
-            missed=len(self.missed),
-            undelivered=len(self.undelivered),
-            incomplete=len(self.incomplete),
-            repeated=len(self.repeated),
-            late=len(self.late_ns),
-            unplugged=len(self.unplugged_at),
-            armed_late=len(self.armed_at),
-            unreported=len(self.unreported),
-            writer_dies=len(self.writer_dies_at),
-        )
-        count.update(kind for faults in self.disk_faults.values() for kind in faults.values())
-        if self.end != "stop":
-            count[self.end] += 1
-        return count
 
 
 class SimulatedClock:
@@ -201,8 +189,9 @@ class SimulatedCamera(Camera):
 class SimulatedDisk:
     """Keeps everything in memory, knows what is synced, fails as planned. Writes are numbered over all its files."""
 
-    def __init__(self, faults: dict[int, str], count_write: Callable[[], None]) -> None:
+    def __init__(self, faults: dict[int, str], count_write: Callable[[], None], fired: Counter[str]) -> None:
         self.faults = faults
+        self.fired = fired
         self.files: dict[Path, SimulatedFile] = {}
         self.writes = 0
         self.took_ns = 0  # by the writes since it was last set to 0
@@ -235,6 +224,10 @@ class SimulatedFile:
         if self.direct:
             assert len(data) % 4096 == len(self.data) % 4096 == 0, "O_DIRECT would refuse this"
         fault = disk.faults.pop(disk.writes, "")
+        if fault == "short write" and not self.direct:  # it would be whole at once: wait for a frame
+            disk.faults[disk.writes + 1], fault = fault, ""
+        elif fault and fault != "sync fails":
+            disk.fired[fault] += 1
         disk.took_ns += {"stall": 200_000_000, "long stall": 1_500_000_000}.get(fault, 3_000_000)
         if fault in ("full", "EIO"):
             disk.broken = OSError(errno.ENOSPC if fault == "full" else errno.EIO, fault)
@@ -255,6 +248,7 @@ class SimulatedFile:
 
     def sync(self) -> None:
         if self.disk.faults.pop(-1, ""):
+            self.disk.fired["sync fails"] += 1
             self.disk.broken = OSError(errno.EIO, "sync fails")
         if self.disk.broken is not None:
             raise self.disk.broken
@@ -282,6 +276,7 @@ class Outcome:
     lost: Counter[str]
     recorded: int
     dropped_by_driver: int
+    fired: Counter[str]
 
 
 class Simulation:
@@ -294,6 +289,8 @@ class Simulation:
         self.triggers = PatientlessLog(1e9 / PERIOD_NS)
         places = list(itertools.product(SIDES, CAMERAS))
         self.lost: Counter[str] = Counter()
+        self.lost_at: dict[tuple[Place, int], str] = {}
+        self.fired: Counter[str] = Counter()  # the faults that came to pass
         self.ledger = Ledger(places, 0, self.clock.utc_ns, self._on_loss)
         self.cameras = {place: SimulatedCamera(place, plan.seed) for place in places}
         self.events: list[tuple[int, int, Callable[[], None]]] = []
@@ -304,7 +301,9 @@ class Simulation:
         self.dead_writers: set[str] = set()
         self.lost_cameras: set[Place] = set()
         self.dropped_by_driver = 0
-        self.disks = {side: SimulatedDisk(plan.disk_faults.get(side, {}), self._count_write) for side in SIDES}
+        self.disks = {
+            side: SimulatedDisk(dict(plan.disk_faults.get(side, {})), self._count_write, self.fired) for side in SIDES
+        }
         self.lanes: dict[str, Lane] = {}
 
     def run(self, folder: Path) -> Outcome:
@@ -322,15 +321,17 @@ class Simulation:
                 real.write_bytes(file.survivors(end, draw))
         violations = self._check_stopped(folder) if end == "stop" else self._check_killed(folder, end)
         recorded = sum(account.recorded for account in self.ledger.accounts().values())
-        return Outcome(self.plan, violations, self.lost, recorded, self.dropped_by_driver)
+        return Outcome(self.plan, violations, self.lost, recorded, self.dropped_by_driver, self.fired)
 
     def _on_loss(self, loss) -> None:
         self.lost[loss.stage] += 1
+        self.lost_at[(loss.side, loss.camera), loss.trigger_index] = loss.stage
         self.aux.loss(loss)
 
     def _count_write(self) -> None:
         self.total_writes += 1
         if self.total_writes >= self.plan.end_at_write:
+            self.fired[self.plan.end] += 1
             raise Killed
 
     def _at(self, time_ns: int, action: Callable[[], None]) -> None:
@@ -371,25 +372,33 @@ class Simulation:
 
     def _edge(self, index: int, edge_ns: int) -> None:
         pulse = Pulse(index, 100 + index, edge_ns, edge_ns)
+        self.fired["unreported"] += index in self.plan.unreported
         if index not in self.plan.unreported:
             self.triggers.add(pulse)
             self.ledger.triggered(index + 1)
             self.aux.trigger(Trigger(index, pulse.counter, edge_ns, edge_ns, edge_ns))
         for place, camera in self.cameras.items():
             event = (place, index)
-            if place in self.lost_cameras or event in self.plan.missed or index < self.plan.armed_at.get(place, 0):
+            if place in self.lost_cameras:
+                continue
+            if event in self.plan.missed or index < self.plan.armed_at.get(place, 0):
+                self.fired["missed" if event in self.plan.missed else "armed late"] += 1
                 continue
             if index >= self.plan.unplugged_at.get(place, NOTHING):
                 camera.due.append(CameraLost("unplugged"))
                 self.lost_cameras.add(place)
+                self.fired["unplugged"] += 1
                 self._at(edge_ns, lambda p=place: self._read(p))
                 continue
+            self.fired["late"] += event in self.plan.late_ns
             ready_ns = edge_ns + EXPOSURE_US * 1000 + ROW_TIME_NS * HEIGHT + 1_000_000 + self.plan.late_ns.get(event, 0)
             self._at(ready_ns, lambda p=place, i=index, t=edge_ns: self._deliver(p, i, t))
 
     def _deliver(self, place: Place, index: int, edge_ns: int) -> None:
         camera, event = self.cameras[place], (place, index)
         camera.frame_id = (camera.frame_id + 1) % 65536
+        for kind in ("undelivered", "incomplete", "repeated"):
+            self.fired[kind] += event in getattr(self.plan, kind)
         if event in self.plan.undelivered:
             return
         status = FrameStatus.INCOMPLETE if event in self.plan.incomplete else FrameStatus.COMPLETE
@@ -415,6 +424,7 @@ class Simulation:
             self.items[side] += 1
             if self.items[side] == self.plan.writer_dies_at.get(side):
                 self.dead_writers.add(side)
+                self.fired["writer dies"] += 1
                 return
             recorder.step(0.0)
         self._at(self.clock.now_ns + max(disk.took_ns, 1_000_000), lambda: self._write(side))
@@ -466,6 +476,10 @@ class Simulation:
                     found.append(f"{place} trigger {index} is recorded, but the camera never gave it")
         if self.plan.takeover and self.lost["disk"] and not all(disk.broken for disk in self.disks.values()):
             found.append(f"{self.lost['disk']} frames lost at the disk although the other one could take over")
+        for (place, index), stage in self.lost_at.items():
+            partner = (place[0], CAMERAS[1 - CAMERAS.index(place[1])])
+            if stage == "ring" and index in report.cameras["/".join(partner)].indices:
+                found.append(f"{place} trigger {index} was lost at the ring, its partner's frame was kept")
         return found + self._wrong_contents(folder)
 
     @property
