@@ -333,10 +333,10 @@ class SegmentWriter:
             self._write(memoryview(block))
             return
         length = _round_up(len(block) + _RECORD.size, PAGE)
-        with mmap.mmap(-1, length) as page_aligned, memoryview(page_aligned) as view:
-            view[: len(block)] = block
-            _pad(view, len(block), length)
-            self._write(view)
+        view = memoryview(mmap.mmap(-1, length))  # freed with its last user: a failed write may still hold a part of it
+        view[: len(block)] = block
+        _pad(view, len(block), length)
+        self._write(view)
 
     def _write(self, view: memoryview) -> None:
         file = self._open_file()

@@ -7,7 +7,7 @@ one camera, 2080×1552, mono8) and ends with its data on the disk (fsync). Memor
     raw write     os.write to a plain file
     mcap          mcap.writer.Writer as it comes: 1 MB chunks, zstd off (frames do not compress), CRC on
     foxglove-sdk  chunks and CRC on, no compression
-    gstreamer     fakesrc-like file source into filesink, where gst-launch-1.0 is installed
+    gstreamer     fakesrc (which fills nothing: no cost of its own) into filesink, where gst-launch-1.0 is installed
 """
 
 import argparse
@@ -118,7 +118,7 @@ def foxglove_sdk(folder: Path) -> Callable[[], None]:
 
 
 def gstreamer(folder: Path) -> Callable[[], None]:
-    source = f"fakesrc num-buffers={FRAMES} sizetype=fixed sizemax={SIZE} filltype=random-data"
+    source = f"fakesrc num-buffers={FRAMES} sizetype=fixed sizemax={SIZE} filltype=nothing"
 
     def run() -> None:
         pipeline = f"{source} ! filesink location={folder / 'gst'} buffer-mode=unbuffered o-sync=false".split()

@@ -28,7 +28,7 @@ class Step:
 
 
 SECTIONS: dict[str, tuple[Step, ...]] = {
-    "recorder": (
+    "table8": (
         Step(
             "the paper's full run, ours: 30,000 frames a camera at 322.8 MB/s",
             "wingcap bench --target {target} --mode threaded --frames 30000",
@@ -51,6 +51,11 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
         ),
         Step("2,000 simulated flights with faults", "pytest -q -s -m slow tests/capture/test_fault_simulation.py"),
     ),
+    "beam": (
+        Step(
+            "the beam's slow tests: coverage, 5,000 frames, the paper's way", "pytest -q -s -m slow tests/reconstruct"
+        ),
+    ),
     "chain": (Step("a full-size minute through the whole chain", "wingsim demo -o {target}/demo --seconds 60"),),
 }
 
@@ -70,8 +75,8 @@ def machine() -> str:
     return f"{model}, {os.cpu_count()} cores, {memory_gb:.0f} GB, {system}"
 
 
-def run(step: Step, target: Path) -> str:
-    """The markdown of one step."""
+def run(step: Step, target: Path) -> tuple[bool, str]:
+    """Whether a step succeeded, and its markdown."""
     command = step.command.format(target=target)
     words = shlex.split(command)
     beside = BIN / words[0]
@@ -83,7 +88,7 @@ def run(step: Step, target: Path) -> str:
     seconds = time.monotonic() - begin
     shown = " ".join([*(f"{key}={value}" for key, value in step.environment), step.command.format(target="DIR")])
     output = done.stdout.rstrip() if done.returncode == 0 else f"FAILED ({done.returncode})\n{done.stdout}{done.stderr}"
-    return (
+    return done.returncode == 0, (
         f"### {step.shows[0].upper()}{step.shows[1:]}\n\n`{shown}` ({seconds:.0f} s; load before: {load:.1f})\n\n"
         f"```\n{output}\n```\n"
     )
@@ -97,15 +102,21 @@ def main() -> None:
     given = options.parse_args()
     given.target.mkdir(parents=True, exist_ok=True)
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    failed: list[str] = []
     for name in [given.only] if given.only else SECTIONS:
         page = ROOT / "docs/evidence" / f"{today}-{name}.md"
-        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+        describe = ["git", "describe", "--always", "--dirty"]
+        commit = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True)
         page.write_text(f"# Evidence: {name}, {today}\n\nCommit {commit.stdout.strip()}. {machine()}.\n")
         for step in SECTIONS[name]:
             print(f"{name}: {step.shows}", flush=True)
+            succeeded, text = run(step, given.target.resolve())
+            failed += [] if succeeded else [step.shows]
             with page.open("a") as file:
-                file.write(f"\n{run(step, given.target.resolve())}")
+                file.write(f"\n{text}")
         print(page, flush=True)
+    if failed:
+        sys.exit(f"failed: {'; '.join(failed)}")
 
 
 if __name__ == "__main__":
