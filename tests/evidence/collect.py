@@ -41,6 +41,8 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
             "the ceiling against raw O_DIRECT",
             "wingcap bench --target {target} --mode threaded --rate 60 --frames 600 --ceiling",
         ),
+    ),
+    "recorder": (
         Step(
             "peers, same frames, same disk, in turn", "python tests/benchmarks/recording_peers.py {target} --rounds 9"
         ),
