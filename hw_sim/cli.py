@@ -115,4 +115,28 @@ def truth(
     say(f"{out}: truth of {(to_ns - from_ns) * 1e-9:.3f} s")
 
 
+@app.command("accuracy-scenes")
+def accuracy_scenes(
+    out: OutOption,
+    focal_mm: Annotated[float, typer.Option(min=2.0, max=50.0, help="Focal length of both lenses.")] = 6.75,
+    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 1,
+    z_mm: Annotated[str, typer.Option(help="Distances of the targets.")] = "750,1000,1250,1500,1750,2000,2250",
+) -> None:
+    """Render what an accuracy test looks at: a calibration session, then boards and light pairs at known distances."""
+    from hw_sim.accuracy_scenes import write_accuracy_scenes
+
+    try:
+        distances_m = tuple(float(value) / 1000.0 for value in z_mm.split(","))
+    except ValueError as error:
+        raise UsageError(f"--z-mm {z_mm}: give distances such as 1000,2000") from error
+    if not all(0.2 <= distance <= 20.0 for distance in distances_m):
+        raise UsageError(f"--z-mm {z_mm}: distances are 200 to 20000 mm")
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("images", total=None)
+        count = write_accuracy_scenes(
+            seed, focal_mm, distances_m, out, lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    say(f"{out}: {count} images and truth.json")
+
+
 app.command("demo")(demo)
