@@ -62,9 +62,14 @@ def plot(rows: Sequence[BenchRow], path: Path) -> None:
         latency.set_title(f"{row.mode}, {row.offered_mb_s:.0f} MB/s: {row.dropped_percent:.2f} % dropped")
         latency.set_xlabel("frame in the order of writing")
         latency.set_ylabel("write latency, ms")
+        latency.set_ylim(0.1, 3000)
+        if not row.ring_depth:
+            depth.set_axis_off()
+            depth.text(0.5, 0.5, f"one thread, {row.ring_slots} driver buffers a camera", ha="center", color="grey")
+            continue
         depth.axhline(row.ring_slots, color="tab:red", linewidth=1, label="ring full")
-        if row.ring_depth:
-            depth.plot(*zip(*row.ring_depth, strict=True))
+        depth.plot(*zip(*row.ring_depth, strict=True))
+        depth.set_ylim(0, row.ring_slots * 1.05)
         depth.set_xlabel("time, s")
         depth.set_ylabel("ring slots in use")
         depth.legend()

@@ -28,6 +28,7 @@ app = typer.Typer(
     help="Record a flight, and say what is in a recording and whether it is whole.",
 )
 PROBLEMS_SHOWN = 50
+TABLE_COLUMNS = 130
 FlightFolders = Annotated[list[Path], typer.Argument(help="the flight's folder on each disk, or a folder above them")]
 Json = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
 
@@ -149,7 +150,8 @@ def bench(
     if json:
         say_json({"rows": [row.as_dict() for row in rows], "ceiling": found})
         return
-    Console().print(bench_report.table(rows))
+    console = Console()
+    Console(width=max(console.width, TABLE_COLUMNS)).print(bench_report.table(rows))
     if found is not None:
         say(bench_report.ceiling_line(found))
 
