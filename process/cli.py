@@ -3,6 +3,7 @@
 import typer
 
 from capture.console import run
+from process.accuracy_command import accuracy
 from process.calibrate_command import calibrate
 from process.markers_command import markers
 from process.rig_command import rig
@@ -11,6 +12,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="From recorde
 app.command()(calibrate)
 app.command()(rig)
 app.command()(markers)
+app.command()(accuracy)
 
 
 def main() -> None:
