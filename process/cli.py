@@ -6,6 +6,7 @@ from capture.console import run
 from process.accuracy_command import accuracy
 from process.calibrate_command import calibrate
 from process.markers_command import markers
+from process.plan_command import plan
 from process.rig_command import rig
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="From recorded frames to 3-D markers.")
@@ -13,6 +14,7 @@ app.command()(calibrate)
 app.command()(rig)
 app.command()(markers)
 app.command()(accuracy)
+app.command()(plan)
 
 
 def main() -> None:

@@ -140,6 +140,11 @@ def match(
     )
 
 
+def wing_places_m(side_name: str, layout: MarkerLayout, tip_slope_rad: float) -> Array:
+    """(M, 3) markers, body frame, of a wing bent like a cantilever under an even load to a slope at the tip."""
+    return _Wing(side_name, layout).bent(tip_slope_rad)
+
+
 class _Wing:
     """A half wing's markers in the section's coordinates, and the directions span, chord, normal."""
 
