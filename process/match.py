@@ -80,6 +80,8 @@ class Matches:
     ambiguous: NDArray[np.bool_]
     track: Track | None
     """for the next frame; None if there was too little to follow"""
+    rays: tuple[Rays, Rays] | None = None
+    """all spots of cam0 and cam1, taken through the lens; None where nothing was matched"""
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -137,6 +139,7 @@ def match(
         margin,
         ambiguous,
         next_track,
+        (rays0, rays1),
     )
 
 
@@ -426,4 +429,4 @@ def _match_by_rows(side: RigSide, layout: MarkerLayout, rays0: Rays, rays1: Rays
         spot1[2 * pair : 2 * pair + 2] = order1[fore_aft]
     seen = spot0 != UNSEEN
     whole = len(rays0.xy) == len(rays1.xy) == count
-    return Matches(spot0, spot1, np.where(seen, np.inf, np.nan), seen & (not whole), None)
+    return Matches(spot0, spot1, np.where(seen, np.inf, np.nan), seen & (not whole), None, (rays0, rays1))

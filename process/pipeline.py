@@ -26,7 +26,7 @@ from process.detect import Detections, DetectSettings, detect
 from process.match import UNSEEN, Matches, MatchSettings, Track, match
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
 from process.tables import MARKER_SCHEMA
-from process.triangulate import triangulate
+from process.triangulate import triangulate_as
 
 BLOCK_TRIGGERS = 50
 BLOCKS_WORTH_A_PROCESS = 4  # starting one costs as much as processing a block or two
@@ -275,14 +275,8 @@ def _append(
     if found is not None and rows.size:
         spots = matched.spot0[rows], matched.spot1[rows]
         pixels[0, rows], pixels[1, rows] = found[0].pixels[spots[0]], found[1].pixels[spots[1]]
-        points = triangulate(
-            side,
-            pixels[0, rows],
-            pixels[1, rows],
-            found[0].covariance_px2[spots[0]],
-            found[1].covariance_px2[spots[1]],
-            settings.triangulation,
-        )
+        assert matched.rays is not None
+        points = triangulate_as(settings.triangulation, side, matched.rays[0][spots[0]], matched.rays[1][spots[1]])
         numbers["xyz"][rows], numbers["cov"][rows] = points.xyz_m, points.covariance_m2
         epipolar_px[rows] = points.epipolar_px
         timestamps_ns[rows] = _marker_timestamps_ns(frames, side, pixels[0, rows, 1], pixels[1, rows, 1])

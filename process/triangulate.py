@@ -71,6 +71,11 @@ def triangulate(
     """
     rays0 = rays(side.pair.cam0, pixels0, covariance0_px2)
     rays1 = rays(side.pair.cam1, pixels1, covariance1_px2)
+    return triangulate_as(method, side, rays0, rays1)
+
+
+def triangulate_as(method: Method, side: RigSide, rays0: Rays, rays1: Rays) -> Points:
+    """``triangulate`` of what is through the lens already."""
     if method == "paper":
         return _triangulate_paper(side, rays0, rays1)
     return triangulate_rays(side, rays0, rays1)
