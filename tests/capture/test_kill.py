@@ -45,7 +45,7 @@ def hardware(tmp_path) -> Path:
         f'[camera]\nbackend = "simulated"\nwidth = 260\nheight = 194\n{cameras}'
     )
     yield config
-    rig.send_signal(signal.SIGTERM)
+    rig.kill()  # its truth is not asked for
     rig.communicate(timeout=60)
 
 

@@ -42,10 +42,12 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
             "wingcap bench --target {target} --mode threaded --rate 60 --frames 600 --ceiling",
         ),
     ),
-    "recorder": (
+    "peers": (
         Step(
             "peers, same frames, same disk, in turn", "python tests/benchmarks/recording_peers.py {target} --rounds 9"
         ),
+    ),
+    "faults": (
         Step(
             "200 kills at random moments",
             "pytest -q -s -m slow tests/capture/test_kill.py",
