@@ -21,6 +21,7 @@ _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQIIQ")
 _SEARCH_BYTES = 1 << 20
+_READ_AHEAD_BYTES = 16 << 20
 _KNOWN = frozenset({*Opcode, PADDING_OPCODE, GUARD_OPCODE})
 FOOTER_BYTES = 9 + 20 + len(MAGIC)
 _FOOTER_HEAD = _RECORD.pack(Opcode.FOOTER, 20)
@@ -96,6 +97,7 @@ def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
             _demand(found, at, open_from is None, "records before this that no checksum covers")
             open_from = None
         if opcode == Opcode.CHUNK:
+            _read_ahead(data, end)
             index = {}
             yield from _chunk(found, body, at, index)
         elif opcode == GUARD_OPCODE:
@@ -114,6 +116,13 @@ def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
     found.problems.append(
         f"ends at byte {at} of {found.size} without its closing records: it was not closed, or was cut"
     )
+
+
+def _read_ahead(data: memoryview, at: int) -> None:
+    """Ask for what comes next, or each page would be waited for as it is touched: slower by half from disk."""
+    start = at // mmap.PAGESIZE * mmap.PAGESIZE
+    if isinstance(data.obj, mmap.mmap) and start < len(data):
+        data.obj.madvise(mmap.MADV_WILLNEED, start, min(_READ_AHEAD_BYTES, len(data) - start))
 
 
 def _is_damaged(found: Scan, opcode: int, body: memoryview, at: int, index: dict[int, list[tuple[int, int]]]) -> bool:
