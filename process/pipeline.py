@@ -9,7 +9,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
@@ -27,11 +26,11 @@ from process.match import UNSEEN, Matches, MatchSettings, Track, match
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
 from process.tables import MARKER_SCHEMA
 from process.triangulate import triangulate_as
+from process.workers import one_blas_thread
 
 BLOCK_TRIGGERS = 50
 BLOCKS_WORTH_A_PROCESS = 4  # starting one costs as much as processing a block or two
 Progress = Callable[[int, int], None]
-_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,7 @@ def _run_here_and_there(
             yield _process_block(block, rig, settings)
         return
     with (
-        _one_blas_thread(),
+        one_blas_thread(),
         # spawned, not forked: a forked child inherits locks of the parent's threads
         ProcessPoolExecutor(workers - 1, get_context("spawn"), _set_up_worker, (rig, settings)) as pool,
     ):
@@ -177,21 +176,6 @@ def _shared_out(
             for future in [future for future in running if future.done()]:
                 done[running.pop(future)] = future.result()
         yield done.pop(number)
-
-
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    """Environment in which children start with one BLAS thread: the processes are the parallelism."""
-    before = {name: os.environ.get(name) for name in _BLAS_THREADS}
-    os.environ.update(dict.fromkeys(_BLAS_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 _worker: tuple[Rig, PipelineSettings] | None = None

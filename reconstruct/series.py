@@ -5,13 +5,13 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from capture.errors import ReconstructError, UsageError
+from process.workers import one_blas_thread
 from reconstruct.fit import Fit, common_scale, fit_frame
 from reconstruct.instants import InstantMarkers, InstantSettings, at_common_instant
 from reconstruct.smooth import smooth_fits
@@ -23,7 +23,6 @@ _Rows = dict[str, Any]  # field of SideFits → array over a block's sets
 
 BLOCK_SETS = 20  # sets fitted one after the other with warm starts; fixed, so that workers do not change results
 UNLOADED_WING = "unloaded wing"
-_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -191,7 +190,7 @@ def _fit_blocks(blocks: list[_Block], wing: Wing, workers: int) -> Iterator[tupl
         return
     spawn = multiprocessing.get_context("spawn")
     with (
-        _one_blas_thread(),
+        one_blas_thread(),
         ProcessPoolExecutor(workers, mp_context=spawn, initializer=_set_wing, initargs=(wing,)) as pool,
     ):
         pending = {pool.submit(_fit_block_here, block): block for block in blocks}
@@ -203,21 +202,6 @@ def _fit_blocks(blocks: list[_Block], wing: Wing, workers: int) -> Iterator[tupl
         finally:
             for future in pending:
                 future.cancel()
-
-
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    """Processes started inside use one BLAS thread each: more would only compete for the same cores."""
-    before = {name: os.environ.get(name) for name in _BLAS_THREADS}
-    os.environ.update(dict.fromkeys(_BLAS_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 _wing: Wing | None = None  # of a worker process, set once when it starts
