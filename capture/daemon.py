@@ -5,7 +5,6 @@ import datetime
 import json
 import platform
 import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -29,13 +28,13 @@ from capture.ring import check_memory
 from capture.segment import FrameLayout, SmallMessage
 from capture.trigger import BoardCount, TriggerBoard, TriggerLog
 from capture.trigger_protocol import Pulse
+from capture.worker import share_interpreter
 
 CONTROL_PERIOD_S = 0.1
 DIAGNOSTICS_PERIOD_S = 1.0
 SILENT_BOARD_S = 2.0  # a running board that has reported no pulse for so long is asked
 DRAIN_DEADLINE_S = 2.0  # how long frames of the last triggers may take to arrive
 FLUSH_DEADLINE_S = 60.0  # how long the disks may take to write what is in the rings
-GIL_SWITCH_S = 0.0005  # the interpreter's 5 ms would let one busy thread hold up a write
 
 
 @dataclass(frozen=True)
@@ -164,7 +163,7 @@ class Recording:
             CaptureError: something needed at the start is not there: a camera, the board, a disk. What goes wrong
                 later ends only the side it concerns and stands in the result's ``failures``.
         """
-        sys.setswitchinterval(GIL_SWITCH_S)
+        share_interpreter()
         with contextlib.ExitStack() as cleanup:
             self._open_cameras(cleanup)
             board = TriggerBoard(self._config.trigger.port, self._clock, self._on_pulse)
