@@ -424,7 +424,7 @@ def _ceiling_ours(case: BenchCase, folder: Path) -> float:
 
 def _ceiling_raw(case: BenchCase, folder: Path) -> float:
     size = -(-(case.width * case.height + 4096) // mmap.PAGESIZE) * mmap.PAGESIZE
-    # As much memory as the rings have: one buffer over and over would come out of the processor's cache, as no frame does.
+    # As much memory as the rings have: one buffer over and over would come out of the processor's cache.
     slots = round(case.stall_s * case.rate_hz) + DRIVER_BUFFERS
     memory = {side: mmap.mmap(-1, size * slots * len(CAMERAS)) for side in SIDES}
     for area in memory.values():
