@@ -30,12 +30,10 @@ from capture.config import DRIVER_BUFFERS, DiskConfig
 from capture.disk import Disk, DiskFile, SystemDisk
 from capture.errors import UsageError
 from capture.grabber import GRAB_TIMEOUT_S
-from capture.lane import Lane, LaneParts, make_lane
+from capture.lane import Lane, LaneParts, check_ring_memory, make_lane
 from capture.ledger import Ledger
 from capture.record import CAMERAS, SIDES
 from capture.recorder import PREALLOCATE_BYTES
-from capture.ring import check_memory
-from capture.segment import FrameLayout
 from capture.worker import share_interpreter
 
 MONOLITHIC_BUFFERS = 2
@@ -57,6 +55,11 @@ class BenchCase:
     rate_hz: float
     frames: int  # a camera
     stall_s: float = 2.0  # the ring bridges so long a stall
+
+    @property
+    def ring_slots(self) -> int:
+        """Slots of each camera's ring."""
+        return round(self.stall_s * self.rate_hz) + DRIVER_BUFFERS
 
 
 @dataclass
@@ -282,12 +285,11 @@ def _lanes(case: BenchCase, folder: Path, disk: Disk, clock: Clock) -> tuple[Led
         ledger=ledger,
         triggers=triggers,
         clock=clock,
-        ring_slots=round(case.stall_s * case.rate_hz) + DRIVER_BUFFERS,
+        ring_slots=case.ring_slots,
         lock_memory=True,
     )
     cameras = [ClockedCamera(case, triggers) for _ in places]
-    slot_bytes = FrameLayout(1, 2, "left_cam0", case.width, case.height).slot_bytes
-    check_memory(len(places) * parts.ring_slots * slot_bytes)
+    check_ring_memory(len(places), parts.ring_slots, case.width, case.height)
     disk.make_folder(folder)
     lanes = []
     for number, side in enumerate(SIDES):
@@ -349,7 +351,7 @@ def _stop(lanes: Sequence[Lane]) -> float:
 def _run_monolithic(case: BenchCase, folder: Path, disk: Disk, progress: Callable[[float], None]) -> BenchRow:
     """The paper's program: grab a frame from each camera, then write them, in one loop."""
     triggers = ClockedTriggers(0, case.rate_hz)
-    buffers = MONOLITHIC_BUFFERS if case.mode == "monolithic" else round(case.stall_s * case.rate_hz) + DRIVER_BUFFERS
+    buffers = MONOLITHIC_BUFFERS if case.mode == "monolithic" else case.ring_slots
     size = -(-case.width * case.height // mmap.PAGESIZE) * mmap.PAGESIZE
     cameras = [ClockedCamera(case, triggers) for _ in range(4)]
     memory = [mmap.mmap(-1, size * buffers) for _ in cameras]
@@ -425,7 +427,7 @@ def _ceiling_ours(case: BenchCase, folder: Path) -> float:
 def _ceiling_raw(case: BenchCase, folder: Path) -> float:
     size = -(-(case.width * case.height + 4096) // mmap.PAGESIZE) * mmap.PAGESIZE
     # As much memory as the rings have: one buffer over and over would come out of the processor's cache.
-    slots = round(case.stall_s * case.rate_hz) + DRIVER_BUFFERS
+    slots = case.ring_slots
     memory = {side: mmap.mmap(-1, size * slots * len(CAMERAS)) for side in SIDES}
     for area in memory.values():
         for at in range(0, len(area), mmap.PAGESIZE):

@@ -20,12 +20,11 @@ from capture.disk import Disk
 from capture.errors import CameraError, DiskError, TriggerBoardError
 from capture.flight import metadata_yaml
 from capture.grabber import Grabber
-from capture.lane import Lane, LaneParts, make_lane
+from capture.lane import Lane, LaneParts, check_ring_memory, make_lane
 from capture.ledger import CameraAccount, Ledger, Place
 from capture.record import SIDES, Diagnostic, Loss, Trigger, encode_diagnostics
 from capture.recorder import Recorder
-from capture.ring import check_memory
-from capture.segment import FrameLayout, SmallMessage
+from capture.segment import SmallMessage
 from capture.trigger import BoardCount, TriggerBoard, TriggerLog
 from capture.trigger_protocol import Pulse
 from capture.worker import share_interpreter
@@ -232,7 +231,8 @@ class Recording:
             lock_memory=self._config.ring.lock_memory,
             calibration=self._calibration(),
         )
-        check_memory(self._ring_bytes())
+        camera = self._config.camera
+        check_ring_memory(len(self._cameras), self._config.ring_slots, camera.width, camera.height)
         sides = [side for side in SIDES if any(place[0] == side for place in self._cameras)]
         folders = {side: self._make_folder(side) for side in sides}
         for side in sides:
@@ -252,11 +252,6 @@ class Recording:
     def _calibration(self) -> tuple[str, bytes] | None:
         path, content = self._config.calibration, self._loaded.calibration
         return None if path is None or content is None else (path.name, content)
-
-    def _ring_bytes(self) -> int:
-        camera = self._config.camera
-        slot_bytes = FrameLayout(1, 2, "left_cam0", camera.width, camera.height).slot_bytes
-        return len(self._cameras) * self._config.ring_slots * slot_bytes
 
     def _make_folder(self, side: str) -> Path:
         disk: Path = getattr(self._config.disks, side)

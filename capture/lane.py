@@ -13,7 +13,7 @@ from capture.ledger import Ledger
 from capture.numbering import Triggers
 from capture.record import frame_topic, image_topic
 from capture.recorder import Recorder, camera_channels
-from capture.ring import Ring
+from capture.ring import Ring, check_memory
 from capture.segment import FrameLayout
 
 
@@ -46,6 +46,15 @@ class Lane:
         for grabber in self.grabbers.values():
             grabber.arm()
             grabber.start()
+
+
+def check_ring_memory(cameras: int, ring_slots: int, width: int, height: int) -> None:
+    """Refuse rings for which there is not enough memory, before any of it is touched.
+
+    Raises:
+        UsageError: the message has both figures.
+    """
+    check_memory(cameras * ring_slots * FrameLayout(1, 2, "left_cam0", width, height).slot_bytes)
 
 
 def make_lane(

@@ -72,7 +72,6 @@ class WriteStatistics:
     """How the disk is doing."""
 
     frames: int = 0
-    bytes: int = 0
     last_us: int = 0
     latencies_us: deque[int] = field(default_factory=lambda: deque(maxlen=100_000))
 
@@ -204,7 +203,6 @@ class Recorder(Worker):
         took_us = int((self._clock.monotonic_s() - begin_s) * 1e6)
         done = self.statistics
         done.frames += 1
-        done.bytes += len(item.sealed.slot)
         done.last_us = took_us
         done.latencies_us.append(took_us)
 
