@@ -6,12 +6,13 @@ import json
 import platform
 import subprocess
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from capture.aux_log import AuxLog, Companion
 from capture.camera import make_camera
 from capture.camera.base import Camera, CameraDescription
 from capture.clock import Clock
@@ -22,9 +23,8 @@ from capture.flight import metadata_yaml
 from capture.grabber import Grabber
 from capture.lane import Lane, LaneParts, check_ring_memory, make_lane
 from capture.ledger import CameraAccount, Ledger, Place
-from capture.record import SIDES, Diagnostic, Loss, Trigger, encode_diagnostics
+from capture.record import SIDES, Diagnostic, Trigger
 from capture.recorder import Recorder
-from capture.segment import SmallMessage
 from capture.trigger import BoardCount, TriggerBoard, TriggerLog
 from capture.trigger_protocol import Pulse
 from capture.worker import share_interpreter
@@ -97,46 +97,17 @@ class RecordingResult:
         }
 
 
-class AuxLog:
-    """Collects small messages from any thread for the aux files of all disks."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self._messages: list[SmallMessage] = []
-        self._diagnostics = 0
-        self.triggers = 0  # pulses reported by the board
-        self._mutex = threading.Lock()
-
-    def trigger(self, trigger: Trigger) -> None:
-        """A pulse of the board."""
-        self.triggers += 1
-        self._add(SmallMessage(1, trigger.index, trigger.receive_time_ns, trigger.reported_time_ns, trigger.encode()))
-
-    def loss(self, loss: Loss) -> None:
-        """A lost frame."""
-        self._add(SmallMessage(2, loss.trigger_index, loss.time_ns, loss.time_ns, loss.encode()))
-
-    def diagnostics(self, statuses: tuple[Diagnostic, ...]) -> None:
-        """The state of things."""
-        now_ns = self._clock.utc_ns()
-        self._diagnostics += 1
-        self._add(SmallMessage(3, self._diagnostics, now_ns, now_ns, encode_diagnostics(now_ns, statuses)))
-
-    def take(self) -> tuple[SmallMessage, ...]:
-        """What has come since the last call."""
-        with self._mutex:
-            messages, self._messages = tuple(self._messages), []
-        return messages
-
-    def _add(self, message: SmallMessage) -> None:
-        with self._mutex:
-            self._messages.append(message)
-
-
 class Recording:
     """One flight being recorded. Owns every thread and device; ``run`` leaves all of them closed."""
 
-    def __init__(self, loaded: LoadedConfig, clock: Clock, disk: Disk, progress: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        loaded: LoadedConfig,
+        clock: Clock,
+        disk: Disk,
+        progress: Callable[[str], None],
+        companions: Sequence[Companion] = (),
+    ) -> None:
         self._disk = disk
         self._loaded = loaded
         self._config: Config = loaded.config
@@ -148,6 +119,7 @@ class Recording:
         self._triggers = TriggerLog(self._config.trigger.rate_hz)
         self._cameras: dict[Place, tuple[Camera, CameraDescription]] = {}
         self._lanes: dict[str, Lane] = {}
+        self._companions = tuple(companions)
         self._failures: list[str] = []
         self._counter_before: int | None = None  # the board's, before our first pulse
         self._pulse_s = 0.0  # when the last pulse was reported
@@ -175,6 +147,8 @@ class Recording:
             self._counter_before = before.counter
             started_s = self._clock.monotonic_s()
             try:
+                for companion in self._companions:
+                    companion.start(self._aux.put)
                 for lane in self._lanes.values():
                     lane.start()
                 board.begin(self._config.trigger.first_index, stop.triggers)
@@ -182,6 +156,8 @@ class Recording:
             except Exception as error:  # whatever it is: what was recorded is closed and accounted for
                 self._failures.append(f"{type(error).__name__}: {error}")
             count = self._end_triggers(board)
+            for companion in self._companions:
+                companion.stop()
             seconds = self._clock.monotonic_s() - started_s
             return self._finish(before, count, seconds, board)
 
@@ -423,6 +399,8 @@ class Recording:
             )
             for side, recorder in self._recorders.items()
         ]
+        for companion in self._companions:
+            statuses += companion.statuses()
         self._aux.diagnostics(tuple(statuses))
         recorded = sum(account.recorded for account in accounts.values())
         lost = sum(account.lost_total for account in accounts.values())
