@@ -1,7 +1,6 @@
 """Recordings open in other people's readers: Rerun and @mcap/core (the stock mcap and rosbags: test_recording.py)."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -9,6 +8,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from needs import needs_program
 
 from capture.clock import SystemClock
 from capture.config import load_config
@@ -29,8 +29,7 @@ def flight(write_config, rig, tmp_path) -> Path:
 
 
 def test_mcap_core_reads_every_message(flight, tmp_path):
-    if shutil.which("npm") is None and not os.environ.get("CI"):  # in CI this must not be skipped
-        pytest.skip("npm is not installed: @mcap/core cannot be tried")
+    needs_program("npm")
     shutil.copy(SCRIPT, tmp_path)
     (tmp_path / "package.json").write_text('{"type": "module"}')
     subprocess.run(["npm", "install", "--no-audit", "--no-fund", "@mcap/core@2"], cwd=tmp_path, check=True, timeout=120)
