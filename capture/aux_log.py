@@ -2,7 +2,7 @@
 
 import itertools
 import threading
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from typing import Protocol
 
@@ -18,6 +18,10 @@ from capture.record import (
 )
 from capture.recorder import AUX_CHANNELS
 from capture.segment import SmallMessage
+
+MESSAGES_HELD = 100_000
+"""Bound on what waits for the control thread, which comes ten times a second; beyond it, messages of companions are
+dropped and counted. Triggers and losses always fit: their number is that of the frames."""
 
 _CHANNEL = {channel.topic: channel.id for channel in AUX_CHANNELS}
 
@@ -37,6 +41,9 @@ class Companion(Protocol):
     def stop(self) -> None:
         """End; no message after this returns. Safe to call twice."""
 
+    def account(self) -> dict[str, str]:
+        """After ``stop``: what it took and lost, for the flight's last Metadata record. Keys begin with its name."""
+
 
 class AuxLog:
     """Collects small messages until the control thread takes them."""
@@ -46,6 +53,7 @@ class AuxLog:
         self._messages: list[SmallMessage] = []
         self._numbers: defaultdict[str, itertools.count[int]] = defaultdict(lambda: itertools.count(1))
         self.triggers = 0  # pulses reported by the board
+        self.dropped: Counter[str] = Counter()  # messages by topic for which there was no room
         self._mutex = threading.Lock()
 
     def trigger(self, trigger: Trigger) -> None:
@@ -67,6 +75,9 @@ class AuxLog:
     def put(self, topic: str, time_ns: int, data: bytes) -> None:
         """Any other message; numbered from 1 on its topic. ``time_ns`` is the instant that it is about."""
         with self._mutex:
+            if len(self._messages) >= MESSAGES_HELD:
+                self.dropped[topic] += 1
+                return
             number = next(self._numbers[topic])
             self._messages.append(SmallMessage(_CHANNEL[topic], number, self._clock.utc_ns(), time_ns, data))
 

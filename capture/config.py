@@ -5,13 +5,14 @@ import math
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from capture.camera import BACKENDS
 from capture.camera.base import CameraSettings
 from capture.errors import ConfigError
+from capture.trigger_protocol import MAX_CHANNELS
 
 
 class _Table(BaseModel):
@@ -70,6 +71,50 @@ class CameraPlace(_Table):
     serial: str | None = None
 
 
+class CanConfig(_Table):
+    """One CAN bus: ``interface``, ``channel`` and ``options`` are python-can's."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    interface: str
+    channel: str | int
+    options: dict[str, Any] = {}
+
+
+class AnalogChannel(_Table):
+    """One input of the trigger board: value = scale · volts + offset, in the unit that its name says."""
+
+    channel: Annotated[int, Field(ge=0, lt=MAX_CHANNELS)]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+class AnalogConfig(_Table):
+    """The trigger board's analog inputs: how often they are sampled, and which are recorded."""
+
+    rate_hz: Annotated[float, Field(gt=0, le=200)] = 50.0
+    channels: Annotated[list[AnalogChannel], Field(min_length=1, max_length=MAX_CHANNELS)]
+
+    @model_validator(mode="after")
+    def _channels_differ(self) -> "AnalogConfig":
+        for what, values in (
+            ("channel", [str(channel.channel) for channel in self.channels]),
+            ("name", [channel.name for channel in self.channels]),
+        ):
+            for value in values:
+                if values.count(value) > 1:
+                    raise ValueError(f"{what} {value} is there twice")
+        return self
+
+
+class MavlinkConfig(_Table):
+    """The autopilot's MAVLink stream, which is listened to only."""
+
+    address: Annotated[str, Field(pattern=r"^(udp:[^:]*:\d+|/.+)$")]  # udp:<own address>:<port>, or a serial port
+    baud: Annotated[int, Field(gt=0)] = 57600
+    messages: Annotated[list[str], Field(min_length=1)] = ["ATTITUDE", "VFR_HUD"]
+
+
 class Config(_Table):
     """Everything that ``wingcap record`` needs to know."""
 
@@ -80,6 +125,9 @@ class Config(_Table):
     ring: RingConfig = RingConfig()
     flight: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     calibration: Path | None = None
+    can: list[CanConfig] = []
+    analog: AnalogConfig | None = None
+    mavlink: MavlinkConfig | None = None
 
     @model_validator(mode="after")
     def _places_differ(self) -> "Config":
@@ -87,6 +135,10 @@ class Config(_Table):
         for place in places:
             if places.count(place) > 1:
                 raise ValueError(f"cameras: {place[0]} {place[1]} is named twice")
+        buses = [bus.name for bus in self.can]
+        for bus in buses:
+            if buses.count(bus) > 1:
+                raise ValueError(f"can: the bus {bus} is there twice")
         return self
 
     @property

@@ -326,7 +326,10 @@ class Recording:
             "counter_end": str(count.counter if count else before.counter + next_index - first_index),
             "board_confirmed": str(count is not None).lower(),
             "triggers_reported": str(self._aux.triggers),
+            "aux_dropped": json.dumps(self._aux.dropped),
         }
+        for companion in self._companions:
+            end |= companion.account()
         last = self._aux.take()  # booked while the write threads ended
         for recorder in self._recorders.values():
             if recorder.running:  # hung in a write: its files stay as they are, for `wingcap recover`

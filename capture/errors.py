@@ -7,6 +7,7 @@ WingshapeError            exit code 1; the message says what happened, to what, 
 │   ├── CameraError
 │   │   └── CameraLost    the device is gone; its triggers are booked as lost until it is back
 │   ├── TriggerBoardError
+│   ├── LinkError         a CAN bus, the autopilot: what is recorded beside the cameras (also a ConnectionError)
 │   ├── DiskError
 │   └── RecordingError    a recording that cannot be read or is not whole
 ├── ProcessError          (process)
@@ -47,6 +48,10 @@ class CameraLost(CameraError, ConnectionError):
 
 class TriggerBoardError(CaptureError):
     """The trigger board is silent, refuses a command or talks nonsense."""
+
+
+class LinkError(CaptureError, ConnectionError):
+    """What is recorded beside the cameras is missing or gone: a CAN bus, the autopilot."""
 
 
 class DiskError(CaptureError, OSError):

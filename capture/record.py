@@ -15,6 +15,9 @@ CAMERAS = ("cam0", "cam1")  # cam0 is the left one as the pair looks outboard
 TRIGGER_TOPIC = "/trigger"
 LOSS_TOPIC = "/loss"
 DIAGNOSTICS_TOPIC = "/diagnostics"
+CAN_TOPIC = "/can"
+ANALOG_TOPIC = "/analog"
+MAVLINK_TOPIC = "/mavlink"
 PROVENANCE = "wingshape"  # name of the Metadata record that every segment begins with
 FORMAT_VERSION = 1
 
@@ -123,6 +126,7 @@ _CODE_OF_TYPE = {
     "I": "uint32",
     "i": "int32",
     "f": "float32",
+    "d": "float64",
     "B": "uint8",
     "s": "string",
 }
@@ -203,6 +207,81 @@ class Loss(_Message):
     camera: str = _cdr("s")
     stage: str = _cdr("s")
     cause: str = _cdr("s")
+
+
+@dataclass(frozen=True)
+class Analog(_Message):
+    """wingshape_msgs/msg/Analog: one channel of one sample of the trigger board. Times are UTC nanoseconds."""
+
+    time_ns: int = _cdr("q")  # the board's own
+    receive_time_ns: int = _cdr("q")
+    sample: int = _cdr("I")  # the board's number of it
+    channel: int = _cdr("B")
+    name: str = _cdr("s")
+    volts: float = _cdr("d")
+    value: float = _cdr("d")  # scale · volts + offset, as configured
+
+
+@dataclass(frozen=True)
+class CanFrame:
+    """can_msgs/msg/Frame: one frame of a CAN bus."""
+
+    stamp_ns: int  # UTC
+    bus: str  # header.frame_id: the bus's name in the configuration
+    id: int
+    is_rtr: bool
+    is_extended: bool
+    is_error: bool
+    data: bytes  # at most 8
+
+    def encode(self) -> bytes:
+        """CDR bytes."""
+        out = _header(CdrWriter(), self.stamp_ns, self.bus).put("I", self.id)
+        for value in (self.is_rtr, self.is_extended, self.is_error, len(self.data), *self.data.ljust(8, b"\x00")):
+            out.put("B", value)
+        return out.done()
+
+    @classmethod
+    def decode(cls, data: bytes | memoryview) -> Self:
+        """The frame of CDR bytes. Raises ``ValueError`` when they are not such a message."""
+        reader = CdrReader(data)
+        seconds, nanoseconds = reader.get("i"), reader.get("I")
+        bus, number = reader.get("s"), reader.get("I")
+        is_rtr, is_extended, is_error, dlc = (reader.get("B") for _ in range(4))
+        content = bytes(reader.get("B") for _ in range(8))
+        stamp_ns = seconds * 10**9 + nanoseconds
+        return cls(stamp_ns, bus, number, bool(is_rtr), bool(is_extended), bool(is_error), content[:dlc])
+
+
+@dataclass(frozen=True)
+class Mavlink:
+    """wingshape_msgs/msg/Mavlink: the numbers of one MAVLink message."""
+
+    time_ns: int  # UTC, when it was received
+    system: int
+    component: int
+    message: str  # ATTITUDE, VFR_HUD, …
+    fields: tuple[str, ...]
+    values: tuple[float, ...]  # of the fields, as sent: in the units of the MAVLink definitions
+
+    def encode(self) -> bytes:
+        """CDR bytes."""
+        out = CdrWriter().put("q", self.time_ns).put("B", self.system).put("B", self.component).put("s", self.message)
+        out.put("I", len(self.fields))
+        for field_name in self.fields:
+            out.put("s", field_name)
+        out.put("I", len(self.values))
+        for value in self.values:
+            out.put("d", value)
+        return out.done()
+
+    @classmethod
+    def decode(cls, data: bytes | memoryview) -> Self:
+        """The message of CDR bytes. Raises ``ValueError`` when they are not such a message."""
+        reader = CdrReader(data)
+        head = (reader.get("q"), reader.get("B"), reader.get("B"), reader.get("s"))
+        names = tuple(reader.get("s") for _ in range(reader.get("I")))
+        return cls(*head, names, tuple(reader.get("d") for _ in range(reader.get("I"))))
 
 
 @dataclass(frozen=True)
@@ -317,5 +396,17 @@ SCHEMAS: dict[str, str] = {
     "wingshape_msgs/msg/Frame": Frame.definition(),
     "wingshape_msgs/msg/Trigger": Trigger.definition(),
     "wingshape_msgs/msg/Loss": Loss.definition(),
+    "wingshape_msgs/msg/Analog": Analog.definition(),
+    "wingshape_msgs/msg/Mavlink": (
+        "int64 time_ns\nuint8 system\nuint8 component\nstring message\nstring[] fields\nfloat64[] values\n"
+    ),
+    "can_msgs/msg/Frame": _SEPARATOR.join(
+        (
+            "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\n"
+            "uint8[8] data\n",
+            _HEADER,
+            _TIME,
+        )
+    ),
 }
 """ROS 2 definitions of every type in a recording, by type name."""

@@ -12,8 +12,11 @@ from capture.disk import Disk
 from capture.errors import DiskError
 from capture.ledger import Ledger, Place
 from capture.record import (
+    ANALOG_TOPIC,
+    CAN_TOPIC,
     DIAGNOSTICS_TOPIC,
     LOSS_TOPIC,
+    MAVLINK_TOPIC,
     TRIGGER_TOPIC,
     LossStage,
     camera_info_topic,
@@ -29,6 +32,9 @@ AUX_CHANNELS = (
     Channel(1, TRIGGER_TOPIC, "wingshape_msgs/msg/Trigger"),
     Channel(2, LOSS_TOPIC, "wingshape_msgs/msg/Loss"),
     Channel(3, DIAGNOSTICS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray"),
+    Channel(11, CAN_TOPIC, "can_msgs/msg/Frame"),
+    Channel(12, ANALOG_TOPIC, "wingshape_msgs/msg/Analog"),
+    Channel(13, MAVLINK_TOPIC, "wingshape_msgs/msg/Mavlink"),
 )
 AUX_QUEUE = 1024
 SYNC_PERIOD_S = 0.5  # what a power cut may take with it, while the disk keeps up

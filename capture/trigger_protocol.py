@@ -10,18 +10,26 @@ Host to board              board answers
                            stops by itself after ``count`` pulses (0: runs until STOP)
 ``STOP``                   ``OK STOP <next index> <counter>``: no pulse after this line
 ``STATUS``                 ``OK STATUS <running 0|1> <next index> <counter>``
+``ANALOG <millihertz>``    ``OK ANALOG <millihertz>``: from now on samples all analog inputs at this rate, 0: not.
+                           A board without inputs does not know this command
 
 Anything else is answered by ``ERR <code> <words>``. A running board reports each pulse, once, after its edge:
 ``PULSE <index> <counter> <commanded_ns> <actual_ns>``. ``index`` counts from START's argument; ``counter`` counts
 all edges since power-up and is never set back; both times are UTC nanoseconds of the board's PTP clock: when
 the edge was due and when the output register was written.
+
+A board that samples its inputs, be it running or not, reports each sample, once:
+``SAMPLE <number> <time_ns> <volts of channel 0> <of channel 1> …``, at most 8 channels, volts with at most 4 decimals.
+``number`` counts from 0 at each ``ANALOG``; the time is that of the PTP clock.
 """
 
 import binascii
+import math
 from dataclasses import dataclass
 
 PROTOCOL_VERSION = 1
 MAX_LINE_BYTES = 120
+MAX_CHANNELS = 8
 
 
 class GarbledLine(ValueError):
@@ -40,6 +48,19 @@ class Pulse:
     def words(self) -> tuple[str, ...]:
         """The body's words, for the board's side."""
         return ("PULSE", str(self.index), str(self.counter), str(self.commanded_ns), str(self.actual_ns))
+
+
+@dataclass(frozen=True)
+class Sample:
+    """All analog inputs at one instant, as the board reports them."""
+
+    number: int
+    time_ns: int
+    volts: tuple[float, ...]
+
+    def words(self) -> tuple[str, ...]:
+        """The body's words, for the board's side."""
+        return ("SAMPLE", str(self.number), str(self.time_ns), *(f"{value:.4f}" for value in self.volts))
 
 
 def encode_line(*words: str) -> bytes:
@@ -79,3 +100,19 @@ def parse_pulse(words: tuple[str, ...]) -> Pulse:
         return Pulse(int(index), int(counter), int(commanded_ns), int(actual_ns))
     except ValueError as error:
         raise GarbledLine(f"not a pulse: {' '.join(words)[:40]!r}") from error
+
+
+def parse_sample(words: tuple[str, ...]) -> Sample:
+    """The sample of a ``SAMPLE`` line's words.
+
+    Raises:
+        GarbledLine: the words do not make a sample.
+    """
+    try:
+        name, number, time_ns, *volts = words
+        sample = Sample(int(number), int(time_ns), tuple(float(value) for value in volts))
+        if name != "SAMPLE" or not 1 <= len(volts) <= MAX_CHANNELS or not all(map(math.isfinite, sample.volts)):
+            raise ValueError(name)
+    except ValueError as error:
+        raise GarbledLine(f"not a sample: {' '.join(words)[:40]!r}") from error
+    return sample

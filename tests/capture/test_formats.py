@@ -12,10 +12,13 @@ from mcap_ros2.decoder import DecoderFactory
 from capture.ledger import Ledger
 from capture.record import (
     SCHEMAS,
+    Analog,
+    CanFrame,
     Diagnostic,
     Frame,
     Loss,
     LossStage,
+    Mavlink,
     Trigger,
     decode_image,
     encode_camera_info,
@@ -28,6 +31,7 @@ UINT64 = st.integers(0, 2**64 - 1)
 INT64 = st.integers(-(2**63), 2**63 - 1)
 UINT32 = st.integers(0, 2**32 - 1)
 UINT8 = st.integers(0, 255)
+FLOAT64 = st.floats(allow_nan=False)
 TEXT = st.text(st.characters(codec="utf-8", exclude_characters="\x00"), max_size=30)
 
 
@@ -47,7 +51,12 @@ MESSAGES = {
     "Frame": FRAMES,
     "Trigger": st.builds(Trigger, UINT64, UINT64, INT64, INT64, INT64),
     "Loss": st.builds(Loss, UINT64, INT64, TEXT, TEXT, TEXT, TEXT),
-}
+    "Analog": st.builds(Analog, INT64, INT64, UINT32, UINT8, TEXT, FLOAT64, FLOAT64),
+    "Mavlink": st.builds(
+        Mavlink, INT64, UINT8, UINT8, TEXT, st.lists(TEXT, max_size=4).map(tuple),
+        st.lists(FLOAT64, max_size=4).map(tuple),
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MESSAGES)
@@ -56,8 +65,23 @@ def test_own_types_decode_as_any_ros2_reader_would(name, data):
     message = data.draw(MESSAGES[name])
     theirs = decode(f"wingshape_msgs/msg/{name}", message.encode())
     for field in message.__dataclass_fields__:
-        assert getattr(theirs, field) == getattr(message, field)
+        mine = getattr(message, field)
+        assert getattr(theirs, field) == (list(mine) if isinstance(mine, tuple) else mine)
     assert type(message).decode(message.encode()) == message
+
+
+@given(
+    stamp_ns=st.integers(0, 2**31 * 10**9 - 1), bus=TEXT, number=st.integers(0, 2**29 - 1),
+    flags=st.tuples(st.booleans(), st.booleans(), st.booleans()), content=st.binary(max_size=8),
+)  # fmt: skip
+def test_a_can_frame_decodes_as_ros_can_tools_would(stamp_ns, bus, number, flags, content):
+    frame = CanFrame(stamp_ns, bus, number, *flags, content)
+    theirs = decode("can_msgs/msg/Frame", frame.encode())
+    assert theirs.header.stamp.sec * 10**9 + theirs.header.stamp.nanosec == stamp_ns
+    assert (theirs.header.frame_id, theirs.id) == (bus, number)
+    assert (theirs.is_rtr, theirs.is_extended, theirs.is_error) == flags
+    assert bytes(theirs.data)[: theirs.dlc] == content
+    assert CanFrame.decode(frame.encode()) == frame
 
 
 @given(cut=st.integers(0, 80))
