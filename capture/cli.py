@@ -19,6 +19,8 @@ from capture.console import Narrator, run, say, say_json
 from capture.daemon import Recording, RecordingResult, StopRule
 from capture.disk import SystemDisk
 from capture.errors import CaptureError, UsageError
+from capture.preflight import Finding, Situation
+from capture.preflight import preflight as run_checks
 from capture.recover import recover_flight
 from capture.verify import FlightReport, inspect
 
@@ -55,6 +57,32 @@ def record(
         _print_result(result)
     if result.failures:
         raise CaptureError("; ".join(result.failures))
+
+
+@app.command()
+def preflight(
+    config: Annotated[Path, typer.Option("--config", help="the recorder's TOML file")],
+    json: Json = False,
+) -> None:
+    """Check, with numbers, what a flight needs: clock, trigger board, cameras, USB, disks. Nothing is recorded.
+
+    Exit code 0: go. 1: no go, with each reason and what to do.
+    """
+    findings: list[Finding] = []
+    for finding in run_checks(Situation(load_config(config).config, SystemClock())):
+        findings.append(finding)
+        if not json:
+            say(f"{'ok     ' if finding.ok else 'REFUSED'} {finding.name}: {finding.found}")
+            if finding.remedy:
+                say(f"        {finding.remedy}")
+    refused = [finding for finding in findings if not finding.ok]
+    if json:
+        say_json({"go": not refused, "findings": [finding.as_dict() for finding in findings]})
+    if refused:
+        reasons = "; ".join(f"{finding.name}: {finding.found}" for finding in refused)
+        raise CaptureError(f"NO GO, {len(refused)} of {len(findings)} checks refuse: {reasons}")
+    if not json:
+        say(f"GO: {len(findings)} checks")
 
 
 @app.command()

@@ -3,12 +3,9 @@
 import contextlib
 import datetime
 import json
-import platform
-import subprocess
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +20,7 @@ from capture.flight import metadata_yaml
 from capture.grabber import Grabber
 from capture.lane import Lane, LaneParts, check_ring_memory, make_lane
 from capture.ledger import CameraAccount, Ledger, Place
+from capture.provenance import describe_cameras, describe_config, describe_host
 from capture.record import SIDES, Diagnostic, Trigger
 from capture.recorder import Recorder
 from capture.trigger import BoardCount, TriggerBoard, TriggerLog
@@ -225,6 +223,19 @@ class Recording:
             f"bridges a disk stall of {self._config.ring.stall_s:g} s"
         )
 
+    def _provenance(self, board_name: str) -> dict[str, str]:
+        descriptions = {"/".join(place): description for place, (_, description) in self._cameras.items()}
+        return {
+            "flight": self.flight,
+            "flight_id": self._flight_id,
+            **describe_host(),
+            **describe_config(self._loaded),
+            "trigger_board": board_name,
+            **describe_cameras(descriptions),
+            "tai_offset_s": "unknown",
+            "time_base": "UTC of the host's system clock",
+        }
+
     def _calibration(self) -> tuple[str, bytes] | None:
         path, content = self._config.calibration, self._loaded.calibration
         return None if path is None or content is None else (path.name, content)
@@ -412,44 +423,3 @@ class Recording:
             f"triggers {self._triggers_so_far()}  recorded {recorded}  lost {lost}  "
             f"ring {depth}/{self._config.ring_slots}"
         )
-
-    def _provenance(self, board_name: str) -> dict[str, str]:
-        return {
-            "flight": self.flight,
-            "flight_id": self._flight_id,
-            "version": _version(),
-            "commit": _commit(),
-            "host": platform.node(),
-            "kernel": platform.release(),
-            "python": platform.python_version(),
-            "config": self._loaded.text,
-            "config_sha256": self._loaded.sha256,
-            "trigger_board": board_name,
-            "cameras": " ".join("/".join(place) for place in self._cameras),
-            "serials": json.dumps(
-                {"/".join(place): description.serial for place, (_, description) in self._cameras.items()}
-            ),
-            "models": json.dumps(
-                {"/".join(place): description.model for place, (_, description) in self._cameras.items()}
-            ),
-            "tai_offset_s": "unknown",
-            "time_base": "UTC of the host's system clock",
-        }
-
-
-def _version() -> str:
-    try:
-        return version("wingshape")
-    except PackageNotFoundError:
-        return "unknown"
-
-
-def _commit() -> str:
-    """The source's commit where it runs from a checkout, else empty."""
-    try:
-        done = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip() if done.returncode == 0 else ""

@@ -1,0 +1,89 @@
+"""A configuration to a verdict: numeric checks of what a flight needs, each with its figures and what to do.
+
+A check changes nothing for good and takes seconds. The table ``CHECKS`` is the order in which they run.
+"""
+
+import datetime
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from capture.clock import Clock
+from capture.config import Config
+from capture.errors import CaptureError
+from capture.trigger import TriggerBoard
+
+EARLIEST_NS = 1_735_689_600_000_000_000
+"""2025-01-01: a clock before it was never set."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found."""
+
+    name: str
+    ok: bool
+    found: str  # with its figures
+    remedy: str = ""  # what to do, where it is not in order
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "name": self.name,
+            "ok": self.ok,
+            "found": self.found,
+            "remedy": self.remedy,
+            "numbers": dict(self.numbers),
+        }
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What a check may look at."""
+
+    config: Config
+    clock: Clock
+
+
+Check = Callable[[Situation], list[Finding]]
+"""Looks at one thing and says what it found, good or bad. A CaptureError that it raises is a finding too."""
+
+
+def check_clock(situation: Situation) -> list[Finding]:
+    """The computer's clock has been set."""
+    now_ns = situation.clock.utc_ns()
+    said = f"{datetime.datetime.fromtimestamp(now_ns / 1e9, datetime.UTC):%Y-%m-%d %H:%M:%S} UTC"
+    ok = now_ns >= EARLIEST_NS
+    remedy = "" if ok else "set the clock: start PTP or NTP and wait until it has, or `date -u -s …`"
+    return [Finding("clock", ok, f"the computer's clock says {said}", remedy, {"utc_ns": now_ns})]
+
+
+def check_board(situation: Situation) -> list[Finding]:
+    """The trigger board answers, and its protocol is ours."""
+    board = TriggerBoard(situation.config.trigger.port, situation.clock, lambda pulse, trigger: None)
+    try:
+        board.start()
+        name = board.hello()
+        running, count = board.status()
+    finally:
+        board.close()
+    numbers = {"running": running, "next_index": count.next_index, "counter": count.counter}
+    found = f"{name} at {board.port}, {'running' if running else 'stopped'}, counter {count.counter}"
+    return [Finding("trigger board", True, found, numbers=numbers)]
+
+
+CHECKS: Mapping[str, Check] = {
+    "clock": check_clock,
+    "trigger board": check_board,
+}
+
+
+def preflight(situation: Situation, checks: Mapping[str, Check] = CHECKS) -> Iterator[Finding]:
+    """Run the checks one after another; each finding as it is found."""
+    for name, check in checks.items():
+        try:
+            yield from check(situation)
+        except CaptureError as error:
+            found, _, remedy = str(error).rpartition(": ")
+            yield Finding(name, False, found or remedy, remedy if found else "")
