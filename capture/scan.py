@@ -3,11 +3,11 @@
 import io
 import mmap
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from isal.isal_zlib import crc32
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -102,7 +102,7 @@ def _messages(found: Scan, data: memoryview) -> Iterator[ScannedMessage]:
             yield from _chunk(found, body, at, index)
         elif opcode == GUARD_OPCODE:
             covered_from, crc = GUARD.unpack(body) if length == GUARD.size else (None, 0)
-            good = covered_from == open_from and covered_from is not None and zlib.crc32(data[covered_from:at]) == crc
+            good = covered_from == open_from and covered_from is not None and crc32(data[covered_from:at]) == crc
             _demand(found, at, good, "header, channels or metadata that differ from their CRC")
             open_from = None
         elif opcode == Opcode.DATA_END:
@@ -145,7 +145,7 @@ def _what_is_wrong_with_chunk(body: memoryview) -> str:
     content = body[_CHUNK.size :]
     if compression or size != stored or len(content) != size:
         return "a chunk whose lengths do not agree"
-    return "" if zlib.crc32(content) == crc else "a chunk whose content differs from its CRC"
+    return "" if crc32(content) == crc else "a chunk whose content differs from its CRC"
 
 
 def _next_chunk(data: memoryview, at: int) -> int | None:
@@ -175,7 +175,7 @@ def _good_chunk(data: memoryview, at: int) -> bool:
     content_at = body_at + _CHUNK.size
     if compression or size != stored or length != _CHUNK.size + size or not size or content_at + size > len(data):
         return False
-    return zlib.crc32(data[content_at : content_at + size]) == crc
+    return crc32(data[content_at : content_at + size]) == crc
 
 
 def _demand(found: Scan, at: int, fulfilled: bool, otherwise: str) -> None:
@@ -247,7 +247,7 @@ def _check_summary(found: Scan, data: memoryview, at: int) -> bool:
         found.problems.append(f"byte {at}: the summary is cut short")
         return False
     head, summary_at, _, crc = struct.unpack_from("<9sQQI", data, footer_at)
-    if summary_at != at or zlib.crc32(data[at : footer_at + 25]) != crc or bytes(head) != _FOOTER_HEAD:
+    if summary_at != at or crc32(data[at : footer_at + 25]) != crc or bytes(head) != _FOOTER_HEAD:
         found.problems.append(f"byte {at}: the summary differs from its CRC")
         return False
     indexed = sum(1 for opcode in _opcodes(data, at, footer_at) if opcode == Opcode.CHUNK_INDEX)

@@ -17,12 +17,12 @@ multiples of the page size, as O_DIRECT wants.
 import contextlib
 import mmap
 import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from isal.isal_zlib import crc32
 from mcap import records
 from mcap.data_stream import RecordBuilder
 
@@ -120,7 +120,7 @@ class FrameLayout:
         slot[at : self.pixels_at] = image_prefix(stamp_ns, self._frame_id, *self._size)
         at = _put_message(slot, self._frame_at, self._frame_length, frame_channel, sequence, log_ns, publish_ns)
         slot[at : self._records_end] = frame.encode()
-        crc = zlib.crc32(slot[self._records_at : self._records_end])
+        crc = crc32(slot[self._records_at : self._records_end])
         _RECORD.pack_into(slot, self._chunk_at, records.Opcode.CHUNK, _CHUNK_FIELDS.size + records_length)
         _CHUNK_FIELDS.pack_into(
             slot, self._chunk_at + _RECORD.size, log_ns, log_ns, records_length, crc, 0, records_length
@@ -216,7 +216,7 @@ class SegmentWriter:
             message_start_time=first,
             message_end_time=last,
             uncompressed_size=len(content),
-            uncompressed_crc=zlib.crc32(content),
+            uncompressed_crc=crc32(content),
             compression="",
             data=content,
         ).write(out)
@@ -313,7 +313,7 @@ class SegmentWriter:
         self._write_block(block + self._guard(block))
 
     def _guard(self, block: bytes) -> bytes:
-        return _RECORD.pack(GUARD_OPCODE, GUARD.size) + GUARD.pack(self.bytes_written, zlib.crc32(block))
+        return _RECORD.pack(GUARD_OPCODE, GUARD.size) + GUARD.pack(self.bytes_written, crc32(block))
 
     def _put_schemas_and_channels(self, out: RecordBuilder) -> None:
         for name, number in self._schema_ids.items():
@@ -405,7 +405,7 @@ class SegmentWriter:
             records.SummaryOffset(group_opcode=opcode, group_start=start, group_length=length).write(out)
         body: bytes = out.end()
         footer = _RECORD.pack(records.Opcode.FOOTER, 20) + struct.pack("<QQ", summary_at, offsets_at)
-        return body + footer + struct.pack("<I", zlib.crc32(body + footer)) + MAGIC
+        return body + footer + struct.pack("<I", crc32(body + footer)) + MAGIC
 
     def _disk_error(self, error: OSError) -> DiskError:
         return DiskError(

@@ -7,12 +7,12 @@ Format: https://mcap.dev/spec (records and opcodes), version 0.
 
 import os
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from isal.isal_zlib import crc32
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Chunk
@@ -243,7 +243,7 @@ def _records_of_chunk(chunk: memoryview) -> memoryview:
     records = chunk[head.records_at : head.records_at + head.records_size]
     if head.compression:
         records = memoryview(_decompress(head, bytes(records)))
-    if head.crc and zlib.crc32(records) != head.crc:
+    if head.crc and crc32(records) != head.crc:
         raise BadChunk("its CRC does not match")
     return records
 
