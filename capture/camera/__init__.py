@@ -8,6 +8,7 @@ from capture.camera.base import Camera, CameraSettings
 from capture.errors import ConfigError
 
 BACKENDS: Mapping[str, tuple[str, str]] = {
+    "aravis": ("capture.camera.aravis", "AravisCamera"),
     "simulated": ("hw_sim.camera", "SimulatedCamera"),
 }
 

@@ -17,11 +17,17 @@ class CameraSettings:
     height: int
     exposure_us: int
     gain_db: float
+    offset_x: int = 0  # of the region on the sensor
+    offset_y: int = 0
+    black_level: float | None = None  # in the camera's own unit; None: left as it is
+    shutter_mode: str | None = None  # by the camera's own name for it; None: left as it is
+    trigger_line: str = "Line0"
+    trigger_activation: str = "RisingEdge"
 
 
 @dataclass(frozen=True)
 class CameraDescription:
-    """What a camera says it is, read back from the device."""
+    """What a camera says it is, read back from the device, and what it can do."""
 
     model: str
     serial: str
@@ -33,6 +39,10 @@ class CameraDescription:
     tick_hz: float  # nominal rate of the device clock
     frame_id_bits: int  # the frame counter wraps at 2**frame_id_bits
     hardware_trigger: bool  # False: the device runs free
+    frame_counter: bool = True  # frame_id counts exposures: one that was never delivered leaves a gap
+    tells_unplug: bool = True  # grab raises CameraLost when the device is gone
+    firmware: str = ""
+    features: tuple[tuple[str, str], ...] = ()  # what else was set and read back, by the device's own names
 
 
 class FrameStatus(IntEnum):
@@ -53,6 +63,7 @@ class Grab:
     exposure_us: int
     gain_db: float
     status: FrameStatus
+    detail: str = ""  # why it is incomplete, in the driver's words
 
 
 class Camera(ABC):
@@ -85,6 +96,10 @@ class Camera(ABC):
         Raises:
             CameraLost: the device is gone.
         """
+
+    def temperature_c(self) -> float | None:
+        """The device's own temperature; None where it has none or does not answer."""
+        return None
 
     @abstractmethod
     def disarm(self) -> None:

@@ -1,0 +1,82 @@
+"""Every backend's camera in turn, opened by the tests themselves."""
+
+import dataclasses
+import time
+from collections.abc import Iterator
+
+import pytest
+from camera_harness import Harness, make_harness, wanted_harnesses
+
+from capture.camera import make_camera
+from capture.camera.base import Camera, CameraDescription, Grab
+from capture.errors import CameraError
+from capture.ring import PAGE, Ring
+
+SLOTS = 8
+EMPTY = 0xA5
+
+
+class Bench:
+    """A camera on the bench: its harness, and memory for it to fill, with a page around each buffer that must not change."""
+
+    def __init__(self, harness: Harness) -> None:
+        self.harness = harness
+        self.size = harness.settings.width * harness.settings.height
+        self.ring = Ring(SLOTS, PAGE + -(-self.size // PAGE) * PAGE + PAGE, lock_memory=False)
+        self.camera = self.make()
+        for slot in range(SLOTS):
+            self.wipe(slot)
+
+    def make(self, **changes: object) -> Camera:
+        settings = dataclasses.replace(self.harness.settings, **changes)
+        return make_camera(self.harness.backend, self.harness.address, settings)
+
+    def wipe(self, slot: int) -> None:
+        self.ring.slot(slot)[:] = bytes([EMPTY]) * self.ring.slot_bytes
+
+    def pixels(self, slot: int) -> memoryview:
+        return self.ring.slot(slot)[PAGE : PAGE + self.size]
+
+    def intact(self, slot: int) -> bool:
+        """Whether nothing outside the pixels was touched."""
+        whole = self.ring.slot(slot)
+        return set(whole[:PAGE]) == {EMPTY} == set(whole[PAGE + self.size :])
+
+    def open(self) -> CameraDescription:
+        """Open, patiently: after an unplug a device needs its time."""
+        deadline_s = time.monotonic() + self.harness.back_within_s
+        while True:
+            try:
+                return self.camera.open()
+            except CameraError:
+                if time.monotonic() > deadline_s:
+                    raise
+                time.sleep(0.1)
+
+    def start(self, slots: int = SLOTS) -> CameraDescription:
+        """Open, queue, arm."""
+        description = self.open()
+        for slot in range(slots):
+            self.camera.queue(slot, self.pixels(slot))
+        self.camera.arm()
+        return description
+
+    def expose(self, description: CameraDescription) -> None:
+        """Have one frame taken; one that runs free needs no help."""
+        if description.hardware_trigger:
+            self.harness.trigger()
+
+    def frame(self, description: CameraDescription) -> Grab:
+        """Trigger, and wait for the frame."""
+        self.expose(description)
+        grab = self.camera.grab(self.harness.frame_within_s)
+        assert grab is not None, f"no frame within {self.harness.frame_within_s:g} s"
+        return grab
+
+
+@pytest.fixture(params=wanted_harnesses())
+def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    with make_harness(request.param) as harness:
+        bench = Bench(harness)
+        yield bench
+        bench.camera.close()
