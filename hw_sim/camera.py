@@ -103,7 +103,8 @@ class SimulatedCamera(Camera):
             receive_ns,
             message.exposure_us,
             message.gain_db,
-            FrameStatus.COMPLETE,
+            FrameStatus.COMPLETE if message.complete else FrameStatus.INCOMPLETE,
+            "" if message.complete else "cut short on the way",
         )
 
     def disarm(self) -> None:

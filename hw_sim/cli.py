@@ -99,6 +99,26 @@ def rig(
         note(f"{truth}: truth of {len(pulses)} triggers")
 
 
+SocketOption = Annotated[Path, typer.Option("--socket", help="The rig's socket.")]
+CameraArgument = Annotated[str, typer.Argument(help="left_cam0, left_cam1, right_cam0 or right_cam1.")]
+
+
+@app.command()
+def unplug(camera: CameraArgument, socket: SocketOption) -> None:
+    """Pull the plug of one camera of a running rig."""
+    from hw_sim.hand import do
+
+    do(socket, "unplug", camera)
+
+
+@app.command()
+def plug(camera: CameraArgument, socket: SocketOption) -> None:
+    """Put the plug of an unplugged camera back."""
+    from hw_sim.hand import do
+
+    do(socket, "plug", camera)
+
+
 @app.command()
 def truth(
     world: WorldOption,

@@ -25,6 +25,7 @@ class DeviceCounts:
     exposed: int = 0
     delivered: int = 0
     unwanted: int = 0  # dropped in the camera: no frame was asked for, or no shared slot was free
+    spoilt: int = 0  # dropped or cut short on the way, as a command asked
 
 
 class CameraDevice:
@@ -50,10 +51,14 @@ class CameraDevice:
         self._armed = False
         self._wanted = 0
         self._free: list[int] = []
+        self._plugged = True
+        self._deed = ""  # what happens to the next frame
 
     def connect(self, connection: socket.socket, request: link.OpenRequest) -> link.OpenReply:
         """Give the camera to a client, configured as it asks; the reply says why not."""
         sensor = self._world.sensor
+        if not self._plugged:
+            return link.OpenReply(None, "no such camera: it is unplugged; plug it in")
         if self.connection is not None:
             return link.OpenReply(None, "the camera is in use by another program: close that first")
         if (request.width, request.height) != (sensor.width_px, sensor.height_px):
@@ -75,6 +80,14 @@ class CameraDevice:
         self._renderer.render(self._world.epoch_ns, self._slots[0])  # fills its caches, so that no first frame is late
         self._armed, self._wanted, self._free = False, 0, list(range(link.SLOTS))
         return link.OpenReply(self._description(), "")
+
+    def obey(self, deed: str) -> None:
+        """Do what a hand does to the camera. The caller closes the connection of one that is unplugged."""
+        match deed:
+            case "unplug" | "plug":
+                self._plugged = deed == "plug"
+            case _:
+                self._deed = deed
 
     def disconnect(self) -> None:
         """The client is gone."""
@@ -106,6 +119,10 @@ class CameraDevice:
         self.counts.exposed += 1
         frame_id = self._frame_id
         self._frame_id = (frame_id + 1) % self._frame_ids
+        deed, self._deed = self._deed, ""
+        self.counts.spoilt += bool(deed)
+        if deed == "drop":
+            return None
         if self._wanted == 0 or not self._free:
             self.counts.unwanted += 1
             return None
@@ -114,7 +131,8 @@ class CameraDevice:
         self._renderer.render(edge_ns, self._slots[slot])
         readout_us = self._world.sensor.height_px * self.camera.row_time_us
         ready_ns = edge_ns + round((self._exposure_us + readout_us) * 1000.0)
-        return ready_ns, link.FrameMessage(slot, frame_id, self._ticks(edge_ns), self._exposure_us, self._gain_db)
+        ticks, complete = self._ticks(edge_ns), deed != "truncate"
+        return ready_ns, link.FrameMessage(slot, frame_id, ticks, self._exposure_us, self._gain_db, complete)
 
     def deliver(self, message: link.FrameMessage) -> None:
         """Send a frame that has been read out, unless the client disarmed or went in between."""

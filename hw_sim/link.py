@@ -1,7 +1,8 @@
 """What a simulated camera and its client say to each other on the rig's socket. No I/O, no simulation.
 
 The socket is a Unix one of type SEQPACKET: a message is a packet. The client begins with ``OpenRequest``; the rig
-answers with ``OpenReply``, and with it passes a file descriptor of shared memory that holds ``SLOTS`` images. Then:
+answers with ``OpenReply``, and with it passes a file descriptor of shared memory that holds ``SLOTS`` images. A client
+that begins with ``Command`` instead is a hand at the rig's cables; it is answered ``K`` or in words. After an open:
 
 ``Q``           client: one more frame is wanted; a frame that nobody wants is dropped in the camera
 ``A`` / ``D``   client: arm / disarm, answered by the same letter; disarming also takes back what was wanted
@@ -11,13 +12,15 @@ answers with ``OpenReply``, and with it passes a file descriptor of shared memor
 
 import json
 import struct
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 
 from capture.camera.base import CameraDescription
 
 SLOTS = 12
 WANT, ARM, DISARM, FREE, FRAME = b"Q", b"A", b"D", b"F", b"G"
-_FRAME = struct.Struct("<cIQQIf")
+DONE = b"K"
+DEEDS = ("unplug", "plug", "drop", "truncate")
+_FRAME = struct.Struct("<cIQQIf?")
 _FREE = struct.Struct("<cI")
 MAX_PACKET_BYTES = 4096
 
@@ -68,6 +71,29 @@ class OpenReply:
 
 
 @dataclass(frozen=True)
+class Command:
+    """What a hand does to a camera: ``unplug`` and ``plug`` its cable, ``drop`` or ``truncate`` its next frame."""
+
+    deed: str
+    camera: str
+
+    def encode(self) -> bytes:
+        """The packet."""
+        return json.dumps(asdict(self)).encode()
+
+    @classmethod
+    def decode(cls, packet: bytes) -> "Command":
+        """The command of a packet. Raises ``ValueError`` when it is none."""
+        try:
+            command = cls(**json.loads(packet))
+        except (TypeError, UnicodeDecodeError) as error:
+            raise ValueError(f"not a command: {packet[:40]!r}") from error
+        if command.deed not in DEEDS:
+            raise ValueError(f"{command.deed!r} is not one of {', '.join(DEEDS)}")
+        return command
+
+
+@dataclass(frozen=True)
 class FrameMessage:
     """A frame that waits in shared memory."""
 
@@ -76,10 +102,11 @@ class FrameMessage:
     device_ticks: int
     exposure_us: int
     gain_db: float
+    complete: bool
 
     def encode(self) -> bytes:
         """The packet."""
-        return _FRAME.pack(FRAME, self.slot, self.frame_id, self.device_ticks, self.exposure_us, self.gain_db)
+        return _FRAME.pack(FRAME, *astuple(self))
 
     @classmethod
     def decode(cls, packet: bytes) -> "FrameMessage":

@@ -58,7 +58,7 @@ class Rig:
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._wake_in, selectors.EVENT_READ, self._awake)
         self._thread = threading.Thread(target=self._work, name="cameras", daemon=True)
-        self._board = SimulatedBoard(trigger_port, world.trigger_rate_hz, world.seed, clock, self._edge)
+        self._board = SimulatedBoard(trigger_port, world.trigger_rate_hz, world.seed, clock, self.edge)
 
     def start(self) -> None:
         """Begin to take commands and clients."""
@@ -96,8 +96,8 @@ class Rig:
             self._noise[key] = noise_frames(self._world, exposure_us, gain_db)
         return self._noise[key]
 
-    def _edge(self, pulse: Pulse) -> None:
-        """Called by the board's thread."""
+    def edge(self, pulse: Pulse) -> None:
+        """An edge on the trigger line. From any thread; the board's calls it."""
         self.pulses.append(pulse)
         self._edges.append(pulse)
         self._wake()
@@ -145,7 +145,16 @@ class Rig:
     def _open(self, connection: Any) -> None:
         """A new client's first packet."""
         self._selector.unregister(connection)
-        reply, device = self._opened(connection)
+        try:
+            packet = connection.recv(link.MAX_PACKET_BYTES)
+        except OSError:
+            packet = b""
+        if b'"deed"' in packet:
+            with contextlib.suppress(OSError):
+                connection.send(self._obeyed(packet))
+            connection.close()
+            return
+        reply, device = self._opened(connection, packet)
         try:
             if reply.description is None or device is None:
                 connection.send(reply.encode())
@@ -158,10 +167,25 @@ class Rig:
             if device is not None and device.connection is connection:
                 device.disconnect()
 
-    def _opened(self, connection: socket.socket) -> tuple[link.OpenReply, CameraDevice | None]:
+    def _obeyed(self, packet: bytes) -> bytes:
+        """Do what a command says; the answer."""
         try:
-            request = link.OpenRequest.decode(connection.recv(link.MAX_PACKET_BYTES))
-        except (OSError, ValueError) as error:
+            command = link.Command.decode(packet)
+            device = self._devices[command.camera]
+        except (KeyError, ValueError) as error:
+            return (
+                f"the rig does not understand the command: {error}; its cameras are {', '.join(self._devices)}".encode()
+            )
+        device.obey(command.deed)
+        if command.deed == "unplug" and device.connection is not None:
+            self._selector.unregister(device.connection)
+            device.disconnect()
+        return link.DONE
+
+    def _opened(self, connection: socket.socket, packet: bytes) -> tuple[link.OpenReply, CameraDevice | None]:
+        try:
+            request = link.OpenRequest.decode(packet)
+        except ValueError as error:
             return link.OpenReply(None, f"the rig did not understand the request: {error}"), None
         device = self._devices.get(request.camera)
         if device is None:

@@ -12,6 +12,7 @@ EXPOSURE_TOLERANCE = 0.02  # of what was asked: a camera counts exposure in rows
 EXPOSURE_STEP_US = 20.0
 GAIN_TOLERANCE_DB = 0.1
 BLACK_LEVEL_TOLERANCE = 0.1
+_ROUNDING = 1e-6  # of a bound that was converted
 
 _SHUTTER = ("SensorShutterMode", "ShutterMode")
 _FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
@@ -178,7 +179,7 @@ class Features:
         """Set one of the numbers that go by several names, which the library knows."""
         low, high = ctypes.c_double(), ctypes.c_double()
         self._call(f"arv_camera_get_{what}_bounds", ctypes.byref(low), ctypes.byref(high))
-        possible = low.value - tolerance <= asked <= high.value + tolerance
+        possible = low.value - _ROUNDING <= asked <= high.value + _ROUNDING
         refusal = self._refusal(f"arv_camera_set_{what}", asked) if possible else ""
         got: float = self._call(f"arv_camera_get_{what}")
         if not possible or abs(got - asked) > tolerance:

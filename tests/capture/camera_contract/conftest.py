@@ -17,7 +17,7 @@ EMPTY = 0xA5
 
 
 class Bench:
-    """A camera on the bench: its harness, and memory for it to fill, with a page around each buffer that must not change."""
+    """A camera on the bench: its harness, and memory for it to fill, each buffer between pages that must not change."""
 
     def __init__(self, harness: Harness) -> None:
         self.harness = harness
@@ -72,6 +72,12 @@ class Bench:
         grab = self.camera.grab(self.harness.frame_within_s)
         assert grab is not None, f"no frame within {self.harness.frame_within_s:g} s"
         return grab
+
+    def grab_until_lost(self) -> None:
+        """Grab until the camera is lost, or until it should have been."""
+        deadline_s = time.monotonic() + self.harness.loss_within_s
+        while time.monotonic() < deadline_s:
+            self.camera.grab(0.1)
 
 
 @pytest.fixture(params=wanted_harnesses())

@@ -1,6 +1,7 @@
 """What every camera backend promises the recorder (capture/camera/base.py), on each one's real software stack."""
 
 import gc
+import itertools
 import time
 
 import pytest
@@ -46,9 +47,9 @@ def test_counter_and_clock_go_on_with_every_frame(bench):
     for _ in range(5):
         grabs.append(bench.frame(camera))
         time.sleep(PERIOD_S)
-    steps = [(b.frame_id - a.frame_id) % (1 << camera.frame_id_bits) for a, b in zip(grabs, grabs[1:], strict=False)]
+    steps = [(b.frame_id - a.frame_id) % (1 << camera.frame_id_bits) for a, b in itertools.pairwise(grabs)]
     assert steps == [1] * 4
-    ticks = [(b.device_ticks - a.device_ticks) / camera.tick_hz for a, b in zip(grabs, grabs[1:], strict=False)]
+    ticks = [(b.device_ticks - a.device_ticks) / camera.tick_hz for a, b in itertools.pairwise(grabs)]
     assert all(0.5 * min(PERIOD_S, 1 / 60) < step for step in ticks)
 
 
@@ -181,10 +182,8 @@ def test_a_pulled_plug_is_told_and_the_camera_comes_back(bench):
         return
     bench.frame(camera)
     bench.harness.unplug()
-    begin_s = time.monotonic()
-    with pytest.raises(CameraLost, match="check|running"):
-        while time.monotonic() - begin_s < bench.harness.loss_within_s:
-            bench.camera.grab(0.1)
+    with pytest.raises(CameraLost, match=r"check|running"):
+        bench.grab_until_lost()
     bench.camera.disarm()
     bench.camera.close()
     bench.harness.plug()
