@@ -4,7 +4,7 @@ Lens: the Brown-Conrady polynomial in OpenCV's order k1, k2, p1, p2, k3 (the pap
 distorted coordinates). Pixel (0, 0) is the centre of the top-left pixel, u right, v down.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -218,6 +218,18 @@ class StereoPair:
 
 
 @dataclass(frozen=True)
+class Light:
+    """The bulb of a marker: see ``bulb``. Zeros: a point whose centre is on the surface."""
+
+    standoff_m: float = 0.0
+    """of the light's centre, above the surface that it is fixed to"""
+    standoff_sigma_m: float = 0.0
+    dome_radius_m: float = 0.0
+    """of its round top; 0: flat"""
+    dome_sigma_m: float = 0.0
+
+
+@dataclass(frozen=True)
 class MarkerLayout:
     """Where the markers sit on each wing: a fore and an aft light at each station of the reference axis.
 
@@ -230,6 +242,20 @@ class MarkerLayout:
     """offset of the fore and the aft light, positive forward of the axis"""
     height_m: float
     """offset of the light's centre above the axis, along the section's e3"""
+    light: Light = field(default_factory=Light)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, value: dict[str, Any]) -> Self:
+        fore_m, aft_m = (float(offset) for offset in value["chord_m"])
+        return cls(
+            tuple(float(station) for station in value["pairs_station_m"]),
+            (fore_m, aft_m),
+            float(value["height_m"]),
+            Light(**value.get("light", {})),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,18 +323,13 @@ class Rig:
 
     def write(self, path: Path | str, **report: Any) -> None:
         """Write rig.json; ``report`` holds further top-level entries, such as residuals."""
-        layout = self.markers
         write_json(
             path,
             {
                 "format": RIG_FORMAT,
                 "version": FORMAT_VERSION,
                 "provenance": self.provenance,
-                "markers": {
-                    "pairs_station_m": list(layout.pairs_station_m),
-                    "chord_m": list(layout.chord_m),
-                    "height_m": layout.height_m,
-                },
+                "markers": self.markers.to_dict(),
                 "left": self.left.to_dict(),
                 "right": self.right.to_dict(),
                 **report,
@@ -320,15 +341,8 @@ class Rig:
         """Read rig.json; ProcessError naming the file and the remedy if it cannot be used."""
 
         def build(value: dict[str, Any]) -> "Rig":
-            markers = value["markers"]
-            fore_m, aft_m = (float(offset) for offset in markers["chord_m"])
-            layout = MarkerLayout(
-                tuple(float(station) for station in markers["pairs_station_m"]),
-                (fore_m, aft_m),
-                float(markers["height_m"]),
-            )
             left, right = (RigSide.from_dict(value[side]) for side in ("left", "right"))
-            return cls(left, right, layout, value.get("provenance", {}))
+            return cls(left, right, MarkerLayout.from_dict(value["markers"]), value.get("provenance", {}))
 
         return read_json(path, RIG_FORMAT, FORMAT_VERSION, build, remedy="make it with `wingproc rig`")
 

@@ -20,7 +20,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from capture.errors import ProcessError
-from process.camera_model import Rig, RigSide
+from process.bulb import centres_m, wing_normals
+from process.camera_model import MarkerLayout, Rig, RigSide
 from process.detect import Detections, DetectSettings, detect
 from process.match import UNSEEN, Matches, MatchSettings, Track, match
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
@@ -213,7 +214,7 @@ def _process_set(
     _check_size(frames, side)
     if frames.images[0] is None or frames.images[1] is None:
         count = 2 * len(rig.markers.pairs_station_m)
-        _append(block, frames, side, _unseen(count), None, settings)
+        _append(block, frames, side, _unseen(count), None, settings, rig.markers)
         return track
     found = (detect(frames.images[0], settings.detection), detect(frames.images[1], settings.detection))
     for spots in found:
@@ -221,7 +222,7 @@ def _process_set(
             reason = rejected.reason.split(":")[0]
             block.rejected[reason] = block.rejected.get(reason, 0) + 1
     matched = match(frames.side, side, rig.markers, found, frames.trigger_index, track, settings.matching)
-    _append(block, frames, side, matched, found, settings)
+    _append(block, frames, side, matched, found, settings, rig.markers)
     return matched.track or track
 
 
@@ -246,6 +247,7 @@ def _append(
     matched: Matches,
     found: tuple[Detections, Detections] | None,
     settings: PipelineSettings,
+    layout: MarkerLayout,
 ) -> None:
     """Add a row for each marker of a frame set."""
     count = len(matched.spot0)
@@ -262,6 +264,9 @@ def _append(
         assert matched.rays is not None
         points = triangulate_as(settings.triangulation, side, matched.rays[0][spots[0]], matched.rays[1][spots[1]])
         numbers["xyz"][rows], numbers["cov"][rows] = points.xyz_m, points.covariance_m2
+        if layout.light.dome_radius_m > 0.0:
+            normals = wing_normals(frames.side, layout, numbers["xyz"])
+            numbers["xyz"][rows] = centres_m(side, layout.light, points.xyz_m, normals[rows])
         epipolar_px[rows] = points.epipolar_px
         timestamps_ns[rows] = _marker_timestamps_ns(frames, side, pixels[0, rows, 1], pixels[1, rows, 1])
         for row, spot0, spot1, reason in zip(rows, *spots, points.reasons, strict=True):

@@ -11,7 +11,7 @@ import typer
 from capture.console import note, say, say_json
 from capture.errors import ProcessError
 from process.board import read_grey
-from process.camera_model import MarkerLayout, Rig, RigSide, StereoPair, read_pair
+from process.camera_model import Light, MarkerLayout, Rig, RigSide, StereoPair, read_pair
 from process.detect import Detections, detect
 from process.json_file import finite_or_none, provenance
 from process.rig import PoseFit, approximate_pose, solve_pose
@@ -83,7 +83,10 @@ def build_rig(pairs: dict[str, StereoPair], survey: Survey, fits: dict[str, Pose
         )
         for name in ("left", "right")
     }
-    layout = MarkerLayout(survey.markers.pairs_station_m, survey.markers.chord_m, survey.markers.height_m)
+    markers = survey.markers
+    millimetres = (markers.standoff_mm, markers.standoff_sigma_mm, markers.dome_radius_mm, markers.dome_sigma_mm)
+    light = Light(*(value / 1000.0 for value in millimetres))
+    layout = MarkerLayout(markers.pairs_station_m, markers.chord_m, markers.height_m, light)
     return Rig(sides["left"], sides["right"], layout, made)
 
 

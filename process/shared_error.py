@@ -6,17 +6,22 @@ two times, go together, and a displacement has the error (J₁ − J₂) δ: mos
 
 The pose was fitted with the calibration at hand, and makes up for part of its errors where the surveyed lights were:
 ``RigSide.pose_by_calibration`` says how, and J holds it.
+
+A place on the wing's surface is reached from the light above it. The errors of the lights' stand-off and roundness
+(``bulb``) are shared, too: two more in δ for who asks with ``surface``.
 """
 
 import json
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
+from process.bulb import by_light, light_covariance
 from process.bundle import cross_matrix
-from process.camera_model import PAIR_PARAMETER_NAMES, Rig, RigSide, StereoPair
+from process.camera_model import PAIR_PARAMETER_NAMES, Light, MarkerLayout, Rig, RigSide, StereoPair
 
 Array = NDArray[np.float64]
 
@@ -24,19 +29,32 @@ PARAMETERS = len(PAIR_PARAMETER_NAMES) + 6
 METADATA_KEY = b"wingshape_rig"
 
 
-def shared_covariance(side: RigSide) -> Array:
-    """Covariance (30, 30) of δ; NaN where calibration or survey did not estimate theirs."""
-    covariance = np.zeros((PARAMETERS, PARAMETERS))
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What leads from N lights to the surface below them."""
+
+    light: Light
+    normals: Array
+    """(N, 3) of the surface at the lights, see ``bulb.wing_normals``"""
+
+
+def shared_covariance(side: RigSide, light: Light | None = None) -> Array:
+    """Covariance (30, 30) of δ, (32, 32) with ``light``; NaN where calibration or survey did not estimate theirs."""
+    covariance = np.zeros((PARAMETERS + 2, PARAMETERS + 2))
     covariance[:24, :24] = np.nan if side.pair.covariance is None else side.pair.covariance
-    covariance[24:, 24:] = np.nan if side.pose_covariance is None else side.pose_covariance
+    covariance[24:PARAMETERS, 24:PARAMETERS] = np.nan if side.pose_covariance is None else side.pose_covariance
+    if light is None:
+        return covariance[:PARAMETERS, :PARAMETERS]
+    covariance[PARAMETERS:, PARAMETERS:] = light_covariance(light)
     return covariance
 
 
-def shared_jacobian(side: RigSide, points_m: ArrayLike) -> Array:
-    """J (N, 3, 30): metres of ``points_m`` (N, 3), body frame, by δ. NaN where a point is NaN or out of view.
+def shared_jacobian(side: RigSide, points_m: ArrayLike, surface: Surface | None = None) -> Array:
+    """J (N, 3, 30), or (N, 3, 32) with ``surface``: metres of ``points_m`` (N, 3), body frame, by δ.
 
-    To first order, for triangulation with the same pixels by least reprojection errors: by the pair's parameters θ,
-    dX/dθ = −A⁺ B with A, B the pixels' derivatives by the point and by θ.
+    ``points_m`` are the lights; with ``surface``, J is that of the places below them. NaN where a point is NaN or out
+    of view. To first order, for triangulation with the same pixels by least reprojection errors: by the pair's
+    parameters θ, dX/dθ = −A⁺ B with A, B the pixels' derivatives by the point and by θ.
     """
     points = np.asarray(points_m, np.float64).reshape(-1, 3)
     R, t = side.T_body_cam0[:3, :3], side.T_body_cam0[:3, 3]
@@ -46,17 +64,27 @@ def shared_jacobian(side: RigSide, points_m: ArrayLike) -> Array:
     by_pose[:, :, 3:] = np.eye(3)
     if side.pose_by_calibration is not None:
         by_pair = by_pair + by_pose @ side.pose_by_calibration
-    return np.concatenate([by_pair, by_pose], axis=2)
+    parts = [by_pair, by_pose]
+    if surface is not None:
+        parts.append(by_light(side, points, surface.normals))
+    return np.concatenate(parts, axis=2)
 
 
-def point_covariance_m2(side: RigSide, points_m: ArrayLike) -> Array:
-    """Covariance (N, 3, 3) that points (N, 3) have from calibration and mount."""
-    return _carried(side, shared_jacobian(side, points_m))
+def point_covariance_m2(side: RigSide, points_m: ArrayLike, surface: Surface | None = None) -> Array:
+    """Covariance (N, 3, 3) that lights (N, 3), or the places below them, have from what all frames share."""
+    return _carried(side, shared_jacobian(side, points_m, surface), surface)
 
 
-def displacement_covariance_m2(side: RigSide, from_m: ArrayLike, to_m: ArrayLike) -> Array:
-    """Covariance (N, 3, 3) of ``to_m`` − ``from_m`` (N, 3) from calibration and mount; the noise of both adds to it."""
-    return _carried(side, shared_jacobian(side, to_m) - shared_jacobian(side, from_m))
+def displacement_covariance_m2(
+    side: RigSide, from_m: ArrayLike, to_m: ArrayLike, surfaces: tuple[Surface, Surface] | None = None
+) -> Array:
+    """Covariance (N, 3, 3) of ``to_m`` − ``from_m`` (N, 3) from what all frames share; the noise of both adds to it.
+
+    With ``surfaces``, at both, of the places below the lights: a stand-off's error moves them as the wing turns.
+    """
+    before, after = surfaces or (None, None)
+    change = shared_jacobian(side, to_m, after) - shared_jacobian(side, from_m, before)
+    return _carried(side, change, after)
 
 
 def triangulated_by_calibration(pair: StereoPair, points_cam0: Array) -> Array:
@@ -88,18 +116,26 @@ def triangulated_by_calibration(pair: StereoPair, points_cam0: Array) -> Array:
 
 def with_rig(table: pa.Table, rig: Rig) -> pa.Table:
     """The marker table with what the functions here need in its schema metadata, once a side."""
-    note = json.dumps({side: rig.side(side).to_dict() for side in ("left", "right")}).encode()
+    sides = {side: rig.side(side).to_dict() for side in ("left", "right")}
+    note = json.dumps({**sides, "markers": rig.markers.to_dict()}).encode()
     return table.replace_schema_metadata({**(table.schema.metadata or {}), METADATA_KEY: note})
 
 
 def sides_of(table: pa.Table) -> dict[str, RigSide]:
     """``left`` and ``right`` that the marker table was measured with; empty for tables without (a truth's)."""
     note: dict[str, Any] = json.loads((table.schema.metadata or {}).get(METADATA_KEY, b"{}"))
-    return {name: RigSide.from_dict(value) for name, value in note.items()}
+    return {name: RigSide.from_dict(note[name]) for name in ("left", "right") if name in note}
 
 
-def _carried(side: RigSide, jacobian: Array) -> Array:
-    return np.asarray(jacobian @ shared_covariance(side) @ jacobian.transpose(0, 2, 1))
+def light_of(table: pa.Table) -> Light:
+    """The lights that the marker table was measured from; without errors for tables that do not say (a truth's)."""
+    note: dict[str, Any] = json.loads((table.schema.metadata or {}).get(METADATA_KEY, b"{}"))
+    return MarkerLayout.from_dict(note["markers"]).light if "markers" in note else Light()
+
+
+def _carried(side: RigSide, jacobian: Array, surface: Surface | None) -> Array:
+    covariance = shared_covariance(side, None if surface is None else surface.light)
+    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
 
 
 def _pixels(pair: StereoPair, points_cam0: Array) -> Array:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from capture.errors import ProcessError, UsageError
 
 Metres = Annotated[float, Field(ge=-100.0, le=100.0, allow_inf_nan=False)]
+Millimetres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
 Vector = tuple[Metres, Metres, Metres]
 
 
@@ -59,6 +60,12 @@ class SurveyMarkers(_Strict):
     pairs_station_m: tuple[Annotated[float, Field(ge=0.0, le=100.0)], ...] = Field(min_length=1)
     chord_m: tuple[Metres, Metres]
     height_m: Metres
+    standoff_mm: Millimetres = 0.0
+    """of the light's centre above the surface that it is fixed to"""
+    standoff_sigma_mm: Millimetres = 0.0
+    dome_radius_mm: Millimetres = 0.0
+    """of the bulb's round top; 0: flat"""
+    dome_sigma_mm: Millimetres = 0.0
 
     @model_validator(mode="after")
     def _makes_sense(self) -> "SurveyMarkers":
