@@ -89,7 +89,7 @@ def by_light(side: RigSide, points_m: Array, normals: Array) -> Array:
 
 def _completed(row_m: Array, stations: Array) -> Array:
     """Lights (…, P, 3) of a row, those that are NaN on the parabola through the three nearest known ones."""
-    known = np.isfinite(row_m).all(axis=-1)
+    known = np.asarray(np.isfinite(row_m).all(axis=-1))
     whole = row_m.copy()
     for place in zip(*np.nonzero(~known), strict=True):
         frame = place[:-1]
