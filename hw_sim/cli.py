@@ -4,8 +4,9 @@ import contextlib
 import os
 import signal
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Protocol, TypeVar
 
 import typer
 from rich.console import Console
@@ -79,18 +80,7 @@ def rig(
         clear_truth(truth)
     with contextlib.suppress(OSError):  # real hardware does not wait for the host's other work; take what is allowed
         os.nice(-10)
-    asked = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: asked.set())
-    hardware = Rig(known, socket, trigger_port, SystemClock())
-    try:
-        hardware.start()
-        say("ready")
-        while not asked.wait(0.2):
-            hardware.check()
-    finally:
-        hardware.close()
-    hardware.check()
+    hardware = _be(lambda: Rig(known, socket, trigger_port, SystemClock()))
     for name, counts in hardware.counts().items():
         note(f"{name}: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
     pulses = hardware.pulses
@@ -117,6 +107,33 @@ def plug(camera: CameraArgument, socket: SocketOption) -> None:
     from hw_sim.hand import do
 
     do(socket, "plug", camera)
+
+
+@app.command("usb-rig")
+def usb_rig(
+    trigger_port: Annotated[
+        Path, typer.Option(help="Where the trigger board's serial port appears (a symbolic link).")
+    ],
+    cameras: Annotated[int, typer.Option(min=1, max=4, help="How many cameras to plug in.")] = 4,
+    buffer_frames: Annotated[int, typer.Option(min=0, help="Frames a camera can hold back (0: 32 MB of them).")] = 0,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What goes wrong, as 0:unplug@40, 0:plug@60, 1:truncate@20 or 2:hold@30-39; can be repeated."
+        ),
+    ] = None,
+) -> None:
+    """Plug USB3 Vision cameras into this kernel (module vhci-hcd, root), until SIGTERM. Says `ready` when plugged in.
+
+    They show a pattern that depends on camera and trigger. A fault is told by camera and trigger index.
+    """
+    from hw_sim.u3v_rig import U3vRig, UsbFault
+
+    faults = [UsbFault.parse(text) for text in fault or []]
+    hardware = _be(lambda: U3vRig(cameras, trigger_port, SystemClock(), buffer_frames, faults))
+    for plugged in hardware.plugs:
+        counts = vars(plugged.counts).items()
+        note(f"{plugged.serial}: " + ", ".join(f"{count} {what}" for what, count in counts))
 
 
 @app.command()
@@ -160,3 +177,31 @@ def accuracy_scenes(
 
 
 app.command("demo")(demo)
+
+
+class _Hardware(Protocol):
+    def start(self) -> None: ...
+
+    def check(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+H = TypeVar("H", bound=_Hardware)
+
+
+def _be(make: Callable[[], H]) -> H:
+    """Be the hardware that ``make`` makes, until SIGTERM or SIGINT, or until a part of it fails."""
+    asked = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: asked.set())
+    hardware = make()
+    try:
+        hardware.start()
+        say("ready")
+        while not asked.wait(0.2):
+            hardware.check()
+    finally:
+        hardware.close()
+    hardware.check()
+    return hardware
