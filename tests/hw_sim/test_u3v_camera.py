@@ -92,7 +92,7 @@ def test_an_edge_gives_a_frame_with_the_devices_own_time():
     k = np.arange(64 * 48)
     assert np.array_equal(np.frombuffer(frame.payload, np.uint8), (k + 17 * 12 + 60 * 1) % 251)
     assert frame.trailer[:4] == b"U3VT"
-    assert struct.unpack_from("<Q", frame.trailer, 16) == (64 * 48,)
+    assert struct.unpack_from("<Q", frame.trailer, 20) == (64 * 48,)
 
 
 def test_no_frame_before_the_start_nor_on_another_line():
@@ -126,7 +126,7 @@ def test_half_a_frame_says_that_it_is_whole():
     device.edge(3, POWER_UP_NS)
     frame = device.next_frame(0.0)
     assert len(frame.payload) == 64 * 48 // 2
-    assert struct.unpack_from("<Q", frame.trailer, 16) == (64 * 48,)
+    assert struct.unpack_from("<Q", frame.trailer, 20) == (64 * 48,)
 
 
 def test_the_pattern_tells_triggers_apart():
