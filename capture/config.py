@@ -27,6 +27,17 @@ class TriggerConfig(_Table):
     first_index: Annotated[int, Field(ge=0, lt=2**31)] = 0
 
 
+class PtpConfig(_Table):
+    """How this computer's clock is disciplined, and what is demanded of it."""
+
+    role: Literal["slave", "master", "none"] = "slave"  # none: the clock runs free, and that is intended
+    socket: Path = Path("/var/run/ptp4l")  # ptp4l's uds_address
+    domain: Annotated[int, Field(ge=0, le=127)] = 0
+    offset_limit_us: Annotated[float, Field(gt=0)] = 100.0
+    silence_s: Annotated[float, Field(gt=0)] = 1.5  # without a Sync for so long, the master counts as lost
+    phc: Path | None = None  # the network card's clock, where phc2sys moves the system clock after it
+
+
 class DiskConfig(_Table):
     """The two disks, one for each side's pair of cameras."""
 
@@ -123,6 +134,7 @@ class Config(_Table):
     camera: CameraDefaults
     cameras: Annotated[list[CameraPlace], Field(min_length=1, max_length=4)]
     ring: RingConfig = RingConfig()
+    ptp: PtpConfig | None = None
     flight: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     calibration: Path | None = None
     can: list[CanConfig] = []

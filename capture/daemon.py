@@ -20,7 +20,8 @@ from capture.flight import metadata_yaml
 from capture.grabber import Grabber
 from capture.lane import Lane, LaneParts, check_ring_memory, make_lane
 from capture.ledger import CameraAccount, Ledger, Place
-from capture.provenance import describe_cameras, describe_config, describe_host
+from capture.provenance import describe_cameras, describe_config, describe_host, describe_time
+from capture.ptp import FREE_RUNNING, PtpWatch
 from capture.record import SIDES, Diagnostic, Trigger
 from capture.recorder import Recorder
 from capture.trigger import BoardCount, TriggerBoard, TriggerLog
@@ -117,7 +118,9 @@ class Recording:
         self._triggers = TriggerLog(self._config.trigger.rate_hz)
         self._cameras: dict[Place, tuple[Camera, CameraDescription]] = {}
         self._lanes: dict[str, Lane] = {}
-        self._companions = tuple(companions)
+        ptp = self._config.ptp
+        self._ptp = PtpWatch(ptp, clock) if ptp is not None and ptp.role != "none" else None
+        self._companions = (*([self._ptp] if self._ptp else ()), *companions)
         self._failures: list[str] = []
         self._counter_before: int | None = None  # the board's, before our first pulse
         self._pulse_s = 0.0  # when the last pulse was reported
@@ -204,6 +207,7 @@ class Recording:
             ring_slots=self._config.ring_slots,
             lock_memory=self._config.ring.lock_memory,
             calibration=self._calibration(),
+            clock_state=self._ptp.now if self._ptp else lambda: FREE_RUNNING,
         )
         camera = self._config.camera
         check_ring_memory(len(self._cameras), self._config.ring_slots, camera.width, camera.height)
@@ -232,8 +236,7 @@ class Recording:
             **describe_config(self._loaded),
             "trigger_board": board_name,
             **describe_cameras(descriptions),
-            "tai_offset_s": "unknown",
-            "time_base": "UTC of the host's system clock",
+            **describe_time(self._config.ptp),
         }
 
     def _calibration(self) -> tuple[str, bytes] | None:

@@ -7,6 +7,7 @@ WingshapeError            exit code 1; the message says what happened, to what, 
 │   ├── CameraError
 │   │   └── CameraLost    the device is gone; its triggers are booked as lost until it is back
 │   ├── TriggerBoardError
+│   ├── PtpError
 │   ├── LinkError         a CAN bus, the autopilot: what is recorded beside the cameras (also a ConnectionError)
 │   ├── DiskError
 │   └── RecordingError    a recording that cannot be read or is not whole
@@ -52,6 +53,10 @@ class TriggerBoardError(CaptureError):
 
 class LinkError(CaptureError, ConnectionError):
     """What is recorded beside the cameras is missing or gone: a CAN bus, the autopilot."""
+
+
+class PtpError(CaptureError):
+    """ptp4l does not answer, or not with what is needed."""
 
 
 class DiskError(CaptureError, OSError):

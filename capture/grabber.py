@@ -1,13 +1,15 @@
 """The read thread of one camera: filled buffers to numbered, sealed frames in the write queue."""
 
 import threading
+from collections.abc import Callable
 
 from capture.camera.base import Camera, CameraDescription, FrameStatus, Grab
 from capture.config import DRIVER_BUFFERS
 from capture.errors import CameraLost
 from capture.ledger import Ledger, Place
 from capture.numbering import FrameNumbering, Numbered, Triggers
-from capture.record import Frame, LossStage, PtpState
+from capture.ptp import ClockState
+from capture.record import Frame, LossStage
 from capture.recorder import FrameItem, Recorder
 from capture.ring import Ring
 from capture.segment import FrameLayout
@@ -68,6 +70,7 @@ class Grabber(Worker):
         triggers: Triggers,
         ledger: Ledger,
         recorder: Recorder,
+        clock_state: Callable[[], ClockState],
     ) -> None:
         super().__init__(f"read-{place[0]}-{place[1]}")
         self.place = place
@@ -79,6 +82,7 @@ class Grabber(Worker):
         self._gate = gate
         self._ledger = ledger
         self._recorder = recorder
+        self._clock_state = clock_state
         self._numbering = FrameNumbering(description, triggers)
 
     def arm(self) -> None:
@@ -148,7 +152,7 @@ class Grabber(Worker):
             ring_depth=self.ring.in_use,
             previous_write_us=self._recorder.statistics.last_us,
             gain_db=grab.gain_db,
-            ptp_state=PtpState.UNKNOWN,
+            ptp_state=self._clock_state().ptp_state,
             status=grab.status,
         )
         middle_ns = frame.mid_exposure_ns + row_time_ns * (self._description.height - 1) // 2

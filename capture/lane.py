@@ -1,6 +1,6 @@
 """A side's lane: its cameras, their rings and read threads, and the write thread of its disk, wired together."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from capture.disk import Disk
 from capture.grabber import Grabber, SideGate
 from capture.ledger import Ledger
 from capture.numbering import Triggers
+from capture.ptp import FREE_RUNNING, ClockState
 from capture.record import frame_topic, image_topic
 from capture.recorder import Recorder, camera_channels
 from capture.ring import Ring, check_memory
@@ -30,6 +31,7 @@ class LaneParts:
     ring_slots: int
     lock_memory: bool
     calibration: tuple[str, bytes] | None = None  # name and content
+    clock_state: Callable[[], ClockState] = lambda: FREE_RUNNING  # of this computer, asked for each frame
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,16 @@ def make_lane(
     gate = SideGate(list(rings.values()))
     grabbers = {
         name: Grabber(
-            (side, name), camera, description, rings[name], layouts[name], gate, parts.triggers, parts.ledger, recorder
+            (side, name),
+            camera,
+            description,
+            rings[name],
+            layouts[name],
+            gate,
+            parts.triggers,
+            parts.ledger,
+            recorder,
+            parts.clock_state,
         )
         for name, (camera, description) in cameras.items()
     }

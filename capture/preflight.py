@@ -11,10 +11,22 @@ from typing import Any
 from capture.clock import Clock
 from capture.config import Config
 from capture.errors import CaptureError
+from capture.ptp import POLL_S, PtpWatch
 from capture.trigger import TriggerBoard
 
 EARLIEST_NS = 1_735_689_600_000_000_000
 """2025-01-01: a clock before it was never set."""
+
+
+PTP_REMEDIES = {
+    "ptp.answers": "see `journalctl -u ptp4l`",
+    "ptp.state": "wait for ptp4l to reach it, or check the network and that the master runs",
+    "ptp.sync": "check the network and that the master runs",
+    "ptp.offset": "wait until ptp4l has settled; a constant offset means that nothing steers this clock",
+    "ptp.grandmaster": "see which clock took over, and why",
+    "ptp.utc": "give the grandmaster a time source, or tell it: pmc 'SET GRANDMASTER_SETTINGS_NP …'",
+    "ptp.phc": "see `journalctl -u phc2sys`",
+}
 
 
 @dataclass(frozen=True)
@@ -59,6 +71,26 @@ def check_clock(situation: Situation) -> list[Finding]:
     return [Finding("clock", ok, f"the computer's clock says {said}", remedy, {"utc_ns": now_ns})]
 
 
+def check_ptp(situation: Situation) -> list[Finding]:
+    """The clock follows its master, closely, and knows UTC."""
+    config = situation.config.ptp
+    if config is None:
+        remedy = 'add the table `[ptp]`; role = "none" in it says that the clock shall run free'
+        return [Finding("ptp", False, "the configuration does not say what disciplines the computer's clock", remedy)]
+    if config.role == "none":
+        return [Finding("ptp", True, "not used: the clock runs free, as configured")]
+    watch = PtpWatch(config, situation.clock)
+    try:
+        watch.start()
+        situation.clock.sleep(config.silence_s + 2 * POLL_S)  # to see whether Syncs are coming
+        failing, figures, said = watch.failing, watch.figures(), watch.statuses()[0].message
+    finally:
+        watch.stop()
+    if not failing:
+        return [Finding("ptp", True, said, numbers=figures)]
+    return [Finding(name, False, cause, PTP_REMEDIES[name], figures) for name, cause in failing.items()]
+
+
 def check_board(situation: Situation) -> list[Finding]:
     """The trigger board answers, and its protocol is ours."""
     board = TriggerBoard(situation.config.trigger.port, situation.clock, lambda pulse, trigger: None)
@@ -75,6 +107,7 @@ def check_board(situation: Situation) -> list[Finding]:
 
 CHECKS: Mapping[str, Check] = {
     "clock": check_clock,
+    "ptp": check_ptp,
     "trigger board": check_board,
 }
 

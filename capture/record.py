@@ -15,6 +15,8 @@ CAMERAS = ("cam0", "cam1")  # cam0 is the left one as the pair looks outboard
 TRIGGER_TOPIC = "/trigger"
 LOSS_TOPIC = "/loss"
 DIAGNOSTICS_TOPIC = "/diagnostics"
+PTP_TOPIC = "/ptp"
+GATE_TOPIC = "/gate"
 CAN_TOPIC = "/can"
 ANALOG_TOPIC = "/analog"
 MAVLINK_TOPIC = "/mavlink"
@@ -285,6 +287,42 @@ class Mavlink:
 
 
 @dataclass(frozen=True)
+class Ptp(_Message):
+    """wingshape_msgs/msg/Ptp: what this computer's PTP clock is doing."""
+
+    time_ns: int = _cdr("q")
+    offset_ns: int = _cdr("q")  # own clock minus master's, at the last Sync; stale when no more come
+    path_delay_ns: int = _cdr("q")
+    sync_time_ns: int = _cdr("q")  # own clock when the last Sync came
+    phc_offset_ns: int = _cdr("q")  # network card's clock minus system clock, UTC offset taken off; 0 without phc_valid
+    time_sigma_ns: int = _cdr("q")  # one sigma of this computer's UTC; -1: not known
+    utc_offset_s: int = _cdr("i")  # TAI - UTC as the grandmaster says
+    steps_removed: int = _cdr("I")
+    port_state: int = _cdr("B")  # PtpState
+    answers: int = _cdr("B")  # 0: ptp4l does not answer, and nothing above means anything
+    sync_fresh: int = _cdr("B")  # Sync messages are coming
+    utc_offset_valid: int = _cdr("B")
+    gm_present: int = _cdr("B")  # as ptp4l says: stays 1 after the master has died
+    gm_clock_class: int = _cdr("B")
+    phc_valid: int = _cdr("B")
+    grandmaster: str = _cdr("s")
+    clock: str = _cdr("s")  # own identity
+
+
+@dataclass(frozen=True)
+class Gate(_Message):
+    """wingshape_msgs/msg/Gate: something that should be in order was not, from ``begin_ns`` on.
+
+    One message when it begins, with ``end_ns`` 0, and one when it ends.
+    """
+
+    begin_ns: int = _cdr("q")
+    end_ns: int = _cdr("q")  # 0: not yet
+    name: str = _cdr("s")
+    cause: str = _cdr("s")
+
+
+@dataclass(frozen=True)
 class Image:
     """A decoded sensor_msgs/msg/Image header; the pixels are ``data[pixels_at:]`` of its message."""
 
@@ -396,6 +434,8 @@ SCHEMAS: dict[str, str] = {
     "wingshape_msgs/msg/Frame": Frame.definition(),
     "wingshape_msgs/msg/Trigger": Trigger.definition(),
     "wingshape_msgs/msg/Loss": Loss.definition(),
+    "wingshape_msgs/msg/Ptp": Ptp.definition(),
+    "wingshape_msgs/msg/Gate": Gate.definition(),
     "wingshape_msgs/msg/Analog": Analog.definition(),
     "wingshape_msgs/msg/Mavlink": (
         "int64 time_ns\nuint8 system\nuint8 component\nstring message\nstring[] fields\nfloat64[] values\n"
