@@ -89,6 +89,25 @@ def rig(
         note(f"{truth}: truth of {len(pulses)} triggers")
 
 
+@app.command()
+def gige(
+    socket: Annotated[Path, typer.Option(help="Unix socket for `wingsim unplug` and `plug`.")],
+    trigger_port: Annotated[
+        Path, typer.Option(help="Where the trigger board's serial port appears (a symbolic link).")
+    ],
+    cameras: Annotated[int, typer.Option(min=1, max=4, help="How many, at 127.0.0.1, .2, …")] = 2,
+    width: Annotated[int, typer.Option(min=16, help="Of the sensor, pixels.")] = 2080,
+    height: Annotated[int, typer.Option(min=2, help="Of the sensor, pixels.")] = 1552,
+) -> None:
+    """Be GigE Vision cameras on a trigger line until SIGTERM or SIGINT. Says `ready` on standard output when usable.
+
+    For a network namespace of its own: `unshare --net sh -c 'ip link set lo up; …'`, recorder included.
+    """
+    from hw_sim.gige import GigeRig
+
+    _be(lambda: GigeRig(cameras, (width, height), socket, trigger_port, SystemClock()))
+
+
 SocketOption = Annotated[Path, typer.Option("--socket", help="The rig's socket.")]
 CameraArgument = Annotated[str, typer.Argument(help="left_cam0, left_cam1, right_cam0 or right_cam1.")]
 

@@ -24,6 +24,7 @@ from hw_sim import link
 from hw_sim.device import CameraDevice
 from hw_sim.render import Pixels, noise_frames
 from hw_sim.trigger_board import SimulatedBoard
+from hw_sim.unix_socket import listen
 from hw_sim.world import World
 
 _IDLE_S = 0.2
@@ -38,7 +39,7 @@ class Rig:
         Raises:
             SimulationError: the socket or the port cannot be put where asked.
         """
-        self._listener = _listen(socket_path)
+        self._listener = listen(socket_path)
         self.pulses: list[Pulse] = []
         self.error: BaseException | None = None
         self._clock = clock
@@ -207,23 +208,3 @@ class Rig:
             pass
         self._selector.unregister(connection)
         device.disconnect()
-
-
-def _listen(path: Path) -> socket.socket:
-    with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)) as probe:
-        if path.is_socket() and probe.connect_ex(str(path)) == 0:
-            raise SimulationError(f"{path}: another simulated rig is running there: stop it or give another path")
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_socket():
-            path.unlink()
-        listener.bind(str(path))
-    except OSError as error:
-        listener.close()
-        raise SimulationError(
-            f"{path}: the rig's socket cannot be put there ({error}): give a short path (under 100 characters) "
-            "in a folder that can be written"
-        ) from error
-    listener.listen()
-    return listener

@@ -15,6 +15,7 @@ from capture.camera.base import CameraSettings
 HARNESSES = {
     "simulated": "camera_harness_simulated:SimulatedHarness",
     "aravis-fake": "camera_harness_aravis:AravisFakeHarness",
+    "aravis-gige": "camera_harness_aravis:GigeHarness",
 }
 """By name: module in tests/support and class. In a virtual machine others are run: WINGSHAPE_HARNESSES=usb3,v4l2."""
 
