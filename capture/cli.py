@@ -14,6 +14,7 @@ from rich.table import Table
 from capture import bench_report
 from capture.bench import CEILING_PAIRS, MODES, bench_cases, bench_target, ceiling, run_case
 from capture.clock import SystemClock
+from capture.companions import make_companions
 from capture.config import load_config
 from capture.console import Narrator, run, say, say_json
 from capture.daemon import Recording, RecordingResult, StopRule
@@ -47,7 +48,8 @@ def record(
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: requested.set())
     narrator = Narrator()
-    recording = Recording(load_config(config), SystemClock(), SystemDisk(), narrator)
+    loaded, clock = load_config(config), SystemClock()
+    recording = Recording(loaded, clock, SystemDisk(), narrator, make_companions(loaded.config, clock))
     narrator(f"recording {recording.flight}")
     result = recording.run(StopRule(requested, triggers, duration))
     narrator.close()

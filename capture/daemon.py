@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from capture.analog import AnalogLog
 from capture.aux_log import AuxLog, Companion
 from capture.camera import make_camera
 from capture.camera.base import Camera, CameraDescription
@@ -120,7 +121,9 @@ class Recording:
         self._lanes: dict[str, Lane] = {}
         ptp = self._config.ptp
         self._ptp = PtpWatch(ptp, clock) if ptp is not None and ptp.role != "none" else None
-        self._companions = (*([self._ptp] if self._ptp else ()), *companions)
+        self._analog = AnalogLog(self._config.analog, clock) if self._config.analog is not None else None
+        own = [companion for companion in (self._ptp, self._analog) if companion is not None]
+        self._companions = (*own, *companions)
         self._failures: list[str] = []
         self._counter_before: int | None = None  # the board's, before our first pulse
         self._pulse_s = 0.0  # when the last pulse was reported
@@ -138,7 +141,8 @@ class Recording:
         share_interpreter()
         with contextlib.ExitStack() as cleanup:
             self._open_cameras(cleanup)
-            board = TriggerBoard(self._config.trigger.port, self._clock, self._on_pulse)
+            on_sample = self._analog.take if self._analog is not None else None
+            board = TriggerBoard(self._config.trigger.port, self._clock, self._on_pulse, on_sample)
             cleanup.callback(board.close)
             board.start()
             name = board.hello()
@@ -150,6 +154,8 @@ class Recording:
             try:
                 for companion in self._companions:
                     companion.start(self._aux.put)
+                if self._analog is not None:
+                    self._analog.begin(board)
                 for lane in self._lanes.values():
                     lane.start()
                 board.begin(self._config.trigger.first_index, stop.triggers)

@@ -11,7 +11,16 @@ import serial
 from capture.clock import Clock
 from capture.errors import TriggerBoardError
 from capture.record import Trigger
-from capture.trigger_protocol import PROTOCOL_VERSION, GarbledLine, Pulse, decode_line, encode_line, parse_pulse
+from capture.trigger_protocol import (
+    PROTOCOL_VERSION,
+    GarbledLine,
+    Pulse,
+    Sample,
+    decode_line,
+    encode_line,
+    parse_pulse,
+    parse_sample,
+)
 from capture.worker import Worker
 
 REPLY_TIMEOUT_S = 1.0
@@ -83,14 +92,21 @@ class BoardCount:
 
 
 class TriggerBoard(Worker):
-    """The board behind a serial port. ``on_pulse`` is called from the reading thread."""
+    """The board behind a serial port. ``on_pulse`` and ``on_sample`` are called from the reading thread."""
 
-    def __init__(self, port: str, clock: Clock, on_pulse: Callable[[Pulse, Trigger], None]) -> None:
+    def __init__(
+        self,
+        port: str,
+        clock: Clock,
+        on_pulse: Callable[[Pulse, Trigger], None],
+        on_sample: Callable[[Sample], None] | None = None,
+    ) -> None:
         super().__init__("trigger-board")
         self.port = port
         self.garbled_lines = 0
         self._clock = clock
         self._on_pulse = on_pulse
+        self._on_sample = on_sample
         self._replies: queue.SimpleQueue[tuple[str, ...]] = queue.SimpleQueue()
         try:
             self._serial = serial.Serial(port, baudrate=115200, timeout=0.1, write_timeout=1.0, exclusive=True)
@@ -112,6 +128,10 @@ class TriggerBoard(Worker):
     def set_rate(self, rate_hz: float) -> None:
         """Set the pulse rate."""
         self._ask("RATE", str(round(rate_hz * 1000)))
+
+    def sample(self, rate_hz: float) -> None:
+        """Sample the analog inputs at this rate from now on; 0: not."""
+        self._ask("ANALOG", str(round(rate_hz * 1000)))
 
     def begin(self, first_index: int, count: int = 0) -> None:
         """Give pulses from ``first_index`` on; ``count`` of them, or without end."""
@@ -162,6 +182,10 @@ class TriggerBoard(Worker):
                     pulse,
                     Trigger(pulse.index, pulse.counter, pulse.commanded_ns, pulse.actual_ns, self._clock.utc_ns()),
                 )
+            elif words[0] == "SAMPLE":
+                sample = parse_sample(words)
+                if self._on_sample is not None:
+                    self._on_sample(sample)
             else:
                 self._replies.put(words)
         except GarbledLine:

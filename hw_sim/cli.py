@@ -67,12 +67,21 @@ def rig(
         Path, typer.Option(help="Where the trigger board's serial port appears (a symbolic link).")
     ],
     truth: Annotated[Path | None, typer.Option(help="Folder for the truth of the flight, written at the end.")] = None,
+    can: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the aircraft's CAN bus appears: slcan:PATH (a serial adapter on a pseudo-terminal), or a bus "
+            "that python-can opens, such as socketcan:vcan0."
+        ),
+    ] = None,
+    mavlink: Annotated[str | None, typer.Option(help="HOST:PORT that the autopilot sends MAVLink to, by UDP.")] = None,
 ) -> None:
     """Be the hardware, in real time, until SIGTERM or SIGINT. Says `ready` on standard output when usable.
 
     At the end the truth from the first to the last trigger is written, 0.2 s more at both ends.
     """
     from hw_sim.rig import Rig
+    from hw_sim.senders import make_senders
     from hw_sim.truth import AROUND_NS, clear_truth, write_truth
 
     known = World.read(world)
@@ -80,7 +89,8 @@ def rig(
         clear_truth(truth)
     with contextlib.suppress(OSError):  # real hardware does not wait for the host's other work; take what is allowed
         os.nice(-10)
-    hardware = _be(lambda: Rig(known, socket, trigger_port, SystemClock()))
+    clock = SystemClock()
+    hardware = _be(lambda: Rig(known, socket, trigger_port, clock, make_senders(known, clock, can, mavlink)))
     for name, counts in hardware.counts().items():
         note(f"{name}: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
     pulses = hardware.pulses
@@ -153,6 +163,16 @@ def usb_rig(
     for plugged in hardware.plugs:
         counts = vars(plugged.counts).items()
         note(f"{plugged.serial}: " + ", ".join(f"{count} {what}" for what, count in counts))
+
+
+@app.command()
+def dbc(out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")]) -> None:
+    """Write the DBC file of the simulated aircraft's CAN bus."""
+    from hw_sim.can_node import dbc_text
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(dbc_text(), encoding="utf-8")
+    say(f"{out}: load factor, airspeed, attitude and control surfaces")
 
 
 @app.command()

@@ -4,17 +4,20 @@ What is true of the simulated world stays in a private folder until everything i
 command gets to see it, as ``OUT/truth``.
 """
 
+import importlib.util
 import json
 import os
 import shlex
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -135,15 +138,16 @@ def _prepare(steps: Steps, hidden: Path, seed: int, scale: int) -> None:
         "-o", "ground/rig.json",
     )  # fmt: skip
     steps.run("reconstruct", "example", "xhale", "-o", "ground/wing.toml")
+    steps.run("wingsim", "dbc", "-o", "ground/aircraft.dbc")
 
 
 def _record(steps: Steps, hidden: Path, world: World, triggers: int) -> None:
-    socket, port = hidden / "rig.sock", hidden / "trigger"
+    rig = RigAddresses(hidden / "rig.sock", hidden / "trigger", hidden / "can", _mavlink_port())
     config = steps.folder / "wingcap.toml"
-    config.write_text(recorder_config(world, socket, port), encoding="utf-8")
+    config.write_text(recorder_config(world, rig), encoding="utf-8")
     for side in SIDES:
         (steps.folder / f"ssd_{side}").mkdir()
-    with _hardware(hidden / "world.toml", socket, port, hidden / "truth"):
+    with _hardware(hidden / "world.toml", rig, hidden / "truth"):
         steps.run("wingcap", "record", "--config", "wingcap.toml", "--triggers", str(triggers))
     steps.run("wingcap", "verify", "ssd_left/demo", "ssd_right/demo")
 
@@ -158,14 +162,33 @@ def _measure(steps: Steps) -> None:
     )  # fmt: skip
 
 
-def recorder_config(world: World, socket: Path, port: Path) -> str:
+@dataclass(frozen=True)
+class RigAddresses:
+    """Where the simulated hardware is to be found."""
+
+    socket: Path
+    trigger_port: Path
+    can_port: Path
+    mavlink_port: int | None  # None: there is no pymavlink to hear it with
+
+
+def _mavlink_port() -> int | None:
+    """A UDP port that is free."""
+    if importlib.util.find_spec("pymavlink") is None:
+        return None
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def recorder_config(world: World, rig: RigAddresses) -> str:
     """The recorder's configuration for a simulated rig; both disks are folders beside it."""
     lines = [
         'flight = "demo"',
         'calibration = "ground/rig.json"',
         "",
         "[trigger]",
-        f'port = "{port}"',
+        f'port = "{rig.trigger_port}"',
         f"rate_hz = {world.trigger_rate_hz}",
         "",
         "[disks]",
@@ -185,16 +208,35 @@ def recorder_config(world: World, socket: Path, port: Path) -> str:
             "[[cameras]]",
             f'side = "{camera.side}"',
             f'name = "{camera.name}"',
-            f'address = "{socket}#{camera.key}"',
+            f'address = "{rig.socket}#{camera.key}"',
             f'serial = "{camera.serial}"',
         ]
+    lines += [
+        "",
+        "[[can]]",
+        'name = "aircraft"',
+        'interface = "slcan"',
+        f'channel = "{rig.can_port}"',
+        "options = { bitrate = 500000, sleep_after_open = 0.0 }",
+        "",
+        "[analog]",
+        "channels = [",
+        '    { channel = 0, name = "elevator_analog_deg", scale = 10.0, offset = -25.0 },',
+        '    { channel = 1, name = "aileron_analog_deg", scale = 10.0, offset = -25.0 },',
+        "]",
+    ]
+    if rig.mavlink_port is not None:
+        lines += ["", "[mavlink]", f'address = "udp:127.0.0.1:{rig.mavlink_port}"']
     return "\n".join(lines) + "\n"
 
 
 @contextmanager
-def _hardware(world: Path, socket: Path, port: Path, truth: Path) -> Iterator[None]:
+def _hardware(world: Path, rig: RigAddresses, truth: Path) -> Iterator[None]:
     """The simulated hardware, running as a process of its own; it writes the truth when it is switched off."""
-    words = ["rig", "--world", str(world), "--socket", str(socket), "--trigger-port", str(port), "--truth", str(truth)]
+    words = ["rig", "--world", str(world), "--socket", str(rig.socket), "--trigger-port", str(rig.trigger_port)]
+    words += ["--truth", str(truth), "--can", f"slcan:{rig.can_port}"]
+    if rig.mavlink_port is not None:
+        words += ["--mavlink", f"127.0.0.1:{rig.mavlink_port}"]
     say(f"\n$ {shlex.join(['wingsim', *words])} &")
     process = subprocess.Popen([executable("wingsim"), *words], stdout=subprocess.PIPE, text=True)
     try:

@@ -14,6 +14,7 @@ import selectors
 import socket
 import threading
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,10 @@ from capture.clock import Clock
 from capture.errors import SimulationError
 from capture.trigger_protocol import Pulse
 from hw_sim import link
+from hw_sim.aircraft import Aircraft
 from hw_sim.device import CameraDevice
 from hw_sim.render import Pixels, noise_frames
+from hw_sim.senders import Sender
 from hw_sim.trigger_board import SimulatedBoard
 from hw_sim.unix_socket import listen
 from hw_sim.world import World
@@ -33,8 +36,10 @@ _IDLE_S = 0.2
 class Rig:
     """The simulated hardware of one world."""
 
-    def __init__(self, world: World, socket_path: Path, trigger_port: Path, clock: Clock) -> None:
-        """Everything is in place when this returns; nothing runs before ``start``.
+    def __init__(
+        self, world: World, socket_path: Path, trigger_port: Path, clock: Clock, senders: Sequence[Sender] = ()
+    ) -> None:
+        """Everything is in place when this returns; nothing runs before ``start``. ``senders`` run with the rig.
 
         Raises:
             SimulationError: the socket or the port cannot be put where asked.
@@ -59,21 +64,28 @@ class Rig:
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._wake_in, selectors.EVENT_READ, self._awake)
         self._thread = threading.Thread(target=self._work, name="cameras", daemon=True)
-        self._board = SimulatedBoard(trigger_port, world.trigger_rate_hz, world.seed, clock, self.edge)
+        self._senders = tuple(senders)
+        self._board = SimulatedBoard(
+            trigger_port, world.trigger_rate_hz, world.seed, clock, self.edge, Aircraft(world).analog_volts
+        )
 
     def start(self) -> None:
         """Begin to take commands and clients."""
+        for sender in self._senders:
+            sender.start()
         self._thread.start()
         self._board.start()
 
     def check(self) -> None:
         """Raise ``SimulationError`` when one of the threads has failed."""
-        error = self.error or self._board.error
-        if error is not None:
-            raise SimulationError(f"the simulated rig failed: {error!r}") from error
+        for error in (self.error, self._board.error, *(sender.error for sender in self._senders)):
+            if error is not None:
+                raise SimulationError(f"the simulated rig failed: {error!r}") from error
 
     def close(self) -> None:
         """Stop the board, then the cameras; clients see them go."""
+        for sender in self._senders:
+            sender.close()
         self._board.close()
         self._stop.set()
         self._wake()

@@ -1,4 +1,4 @@
-"""The trigger board on a pseudo-terminal: commands of capture.trigger_protocol in, edges and their reports out.
+"""The trigger board on a pseudo-terminal: commands of capture.trigger_protocol in; edges, samples and reports out.
 
 An edge happens at its exact time in the simulated world, ``commanded + a small seeded delay``, whenever this program
 gets to it; late is only its report, as on a busy serial line. The board does not mind the host closing and opening
@@ -16,7 +16,15 @@ import numpy as np
 
 from capture.clock import Clock
 from capture.errors import SimulationError
-from capture.trigger_protocol import MAX_LINE_BYTES, PROTOCOL_VERSION, GarbledLine, Pulse, decode_line, encode_line
+from capture.trigger_protocol import (
+    MAX_LINE_BYTES,
+    PROTOCOL_VERSION,
+    GarbledLine,
+    Pulse,
+    Sample,
+    decode_line,
+    encode_line,
+)
 
 BOARD_NAME = "SimAthena"
 START_DELAY_NS = 20_000_000
@@ -28,8 +36,18 @@ _IDLE_S = 0.2
 class SimulatedBoard:
     """A board that runs in a thread of its own, ``trigger-board``."""
 
-    def __init__(self, port: Path, rate_hz: float, seed: int, clock: Clock, on_pulse: Callable[[Pulse], None]) -> None:
+    def __init__(
+        self,
+        port: Path,
+        rate_hz: float,
+        seed: int,
+        clock: Clock,
+        on_pulse: Callable[[Pulse], None],
+        volts_at: Callable[[int], tuple[float, ...]] | None = None,
+    ) -> None:
         """Make the pseudo-terminal and put a symbolic link to it at ``port``. ``on_pulse`` is called at each edge.
+
+        ``volts_at`` says what is at the analog inputs at a UTC time in ns; None: a board without inputs.
 
         Raises:
             SimulationError: the link cannot be made.
@@ -39,6 +57,8 @@ class SimulatedBoard:
         self.lost_lines = 0
         self._clock = clock
         self._on_pulse = on_pulse
+        self._volts_at = volts_at
+        self._sample_millihertz = self._sampled = self._sample_first_ns = 0
         self._rng = np.random.default_rng([seed, 0x7B])
         self._millihertz = round(rate_hz * 1000)
         self._running = False
@@ -81,15 +101,29 @@ class SimulatedBoard:
     def _work(self) -> None:
         try:
             while not self._stop.is_set():
-                wait_s = _IDLE_S
-                if self._running:
-                    wait_s = min(max((self._due_ns() - self._clock.utc_ns()) * 1e-9, 0.0), _IDLE_S)
+                wait_s = min([_IDLE_S, *(max((due - self._clock.utc_ns()) * 1e-9, 0.0) for due in self._dues_ns())])
                 if select.select([self._board_end], [], [], wait_s)[0]:
                     self._read()
                 while self._running and self._clock.utc_ns() >= self._due_ns():
                     self._pulse()
+                while self._sample_millihertz and self._clock.utc_ns() >= self._sample_due_ns():
+                    self._sample()
         except BaseException as error:
             self.error = error
+
+    def _dues_ns(self) -> list[int]:
+        dues = [self._due_ns()] if self._running else []
+        return [*dues, self._sample_due_ns()] if self._sample_millihertz else dues
+
+    def _sample_due_ns(self) -> int:
+        return self._sample_first_ns + self._sampled * 10**12 // self._sample_millihertz
+
+    def _sample(self) -> None:
+        assert self._volts_at is not None
+        due_ns = self._sample_due_ns()
+        sample = Sample(self._sampled, due_ns, self._volts_at(due_ns))
+        self._sampled += 1
+        self._send(*sample.words())
 
     def _due_ns(self) -> int:
         return self._first_ns + self._given * 10**12 // self._millihertz
@@ -138,6 +172,12 @@ class SimulatedBoard:
                 self._first_ns = self._clock.utc_ns() + START_DELAY_NS
                 self._running = True
                 return ("OK", "START", index, count)
+            case ("ANALOG", millihertz) if self._volts_at is not None:
+                if not 0 <= int(millihertz) <= _HIGHEST_MILLIHERTZ:
+                    raise ValueError(millihertz)
+                self._sample_millihertz, self._sampled = int(millihertz), 0
+                self._sample_first_ns = self._clock.utc_ns()
+                return ("OK", "ANALOG", millihertz)
             case ("STOP",):
                 self._running = False
                 return ("OK", "STOP", str(self._next_index), str(self._counter))

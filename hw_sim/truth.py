@@ -2,7 +2,7 @@
 
 ``markers.parquet`` and ``shape.parquet`` have the columns of docs/reference/formats.md that a truth needs, sampled at
 200 Hz from 0.2 s before the first edge to 0.2 s after the last; their ``trigger_index`` is −1. Markers are the lights'
-centres.
+centres. ``aircraft.parquet`` has the load factor, airspeed, controls and attitude at the same times.
 """
 
 import csv
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from capture.record import SIDES
 from capture.trigger_protocol import Pulse
+from hw_sim.aircraft import Aircraft
 from hw_sim.wing_motion import LedMotion, WingMotion, twist_rad
 from hw_sim.world import World
 
@@ -34,6 +35,8 @@ def write_truth(world: World, from_ns: int, to_ns: int, folder: Path, pulses: li
     times_ns = np.arange(from_ns, to_ns + SAMPLE_NS, SAMPLE_NS, dtype=np.int64)
     _write_table(marker_truth(world, times_ns), world, folder / "markers.parquet")
     _write_table(shape_truth(world, times_ns), world, folder / "shape.parquet")
+    aircraft = {"timestamp_ns": times_ns, **Aircraft(world).at(times_ns).columns()}
+    _write_table(aircraft, world, folder / "aircraft.parquet")
     world.write(folder / "world.toml")
     with (folder / "triggers.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

@@ -9,7 +9,7 @@ import serial
 
 from capture.clock import SystemClock
 from capture.errors import SimulationError
-from capture.trigger_protocol import Pulse, decode_line, encode_line, parse_pulse
+from capture.trigger_protocol import Pulse, decode_line, encode_line, parse_pulse, parse_sample
 from hw_sim.trigger_board import SimulatedBoard
 
 
@@ -133,3 +133,29 @@ def test_a_port_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "trigger").write_text("someone else's file")
     with pytest.raises(SimulationError, match="trigger"):
         SimulatedBoard(tmp_path / "trigger", 25.0, 7, SystemClock(), lambda _: None)
+
+
+def test_analog_samples_until_told_to_stop(tmp_path: Path) -> None:
+    volts = [1.5, -2.25]
+    made = SimulatedBoard(tmp_path / "analog", 25.0, 7, SystemClock(), lambda _: None, lambda _: tuple(volts))
+    made.start()
+    line = Host(made.port)
+    try:
+        assert line.ask("ANALOG", "200000") == ("OK", "ANALOG", "200000")
+        samples = [parse_sample(line.read()) for _ in range(20)]
+        assert [sample.number for sample in samples] == list(range(20))
+        assert {sample.volts for sample in samples} == {(1.5, -2.25)}
+        assert np.ptp(np.diff([sample.time_ns for sample in samples])) == 0
+        line.serial.write(encode_line("ANALOG", "0"))
+        while line.read()[0] == "SAMPLE":
+            pass
+        line.serial.timeout = 0.1
+        assert line.serial.readline() == b""
+        assert line.ask("ANALOG", "999999999") == ("ERR", "2", "bad", "argument")
+    finally:
+        line.serial.close()
+        made.close()
+
+
+def test_a_board_without_inputs_does_not_know_the_command(host: Host) -> None:
+    assert host.ask("ANALOG", "1000") == ("ERR", "1", "unknown", "command")
