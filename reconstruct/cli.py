@@ -17,9 +17,9 @@ from typer.core import TyperGroup
 
 from capture.console import note, run, say, say_json
 from capture.errors import UsageError
+from process.reference import parse_window
 from reconstruct.import_wing import import_wing
 from reconstruct.plan import plan
-from reconstruct.reference import parse_window
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, REPORT, read_result
 from reconstruct.run import Job, Progress, run_comparison, run_job
@@ -63,7 +63,9 @@ def run_command(
     ] = 0.0,
     reference: Annotated[
         Path | None,
-        typer.Option(help="Count displacements from this result, at rest, instead of the unloaded wing."),
+        typer.Option(
+            help="Count displacements from this, not the unloaded wing: of `wingproc reference`, or a result."
+        ),
     ] = None,
     reference_window: Annotated[
         str | None, typer.Option(help="Count displacements from the mean of these seconds of this recording, A:B.")
@@ -79,7 +81,7 @@ def run_command(
         raise UsageError(f"{out}: is a file; give a folder for the result")
     if reference is not None and reference_window is not None:
         raise UsageError("give --reference or --reference-window, not both")
-    at_rest = parse_window(reference_window) if reference_window is not None else reference
+    at_rest = parse_window(reference_window, "--reference-window") if reference_window is not None else reference
     job = Job(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest)
     with _progress() as progress:
         summary, warnings = run_job(job, progress)

@@ -1,50 +1,38 @@
 """Fits of a flight → the shape that displacements and twist are counted from: unloaded, or recorded at rest."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 from capture.errors import UsageError
-from reconstruct.series import SideFits
-from reconstruct.tables import SHAPE, Floats, read_table, shape_series
-
-
-@dataclass(frozen=True)
-class Window:
-    """Seconds since the first set, in which the wing is at rest."""
-
-    begin_s: float
-    end_s: float
-
+from process.reference import Window
+from reconstruct.series import SideFits, fit_series
+from reconstruct.tables import SHAPE, Floats, marker_series, read_table, shape_series
+from reconstruct.wing import Wing
 
 Reference = Window | Path | None
-"""a window of this recording, another result (its folder, or its shape table), or the unloaded wing"""
+"""a window of this recording, markers at rest, another result (its folder, its shape table), or the unloaded wing"""
 
 
-def parse_window(text: str) -> Window:
-    """``A:B`` in seconds. Raises UsageError when it is not that."""
-    try:
-        begin, end = (float(part) for part in text.split(":"))
-    except ValueError:
-        raise UsageError(f"--reference-window {text}: give two times in seconds as A:B, for instance 0:5") from None
-    if not 0 <= begin < end < np.inf:
-        raise UsageError(f"--reference-window {text}: A must not be negative, and B later than A")
-    return Window(begin, end)
-
-
-def refer(fits: Mapping[str, SideFits], reference: Reference) -> dict[str, SideFits]:
+def refer(fits: Mapping[str, SideFits], reference: Reference, wing: Wing) -> dict[str, SideFits]:
     """The fits, with the shape their displacements are counted from, and its name.
 
-    A recorded reference is the mean over its fitted sets; its own noise, smaller by the root of their number, is not in
-    any sigma. Raises UsageError when it has no fitted set of a side, or other stations.
+    Markers at rest (``wingproc reference``) are fitted with ``wing``, as the flight's were. Of a window or a result it
+    is the mean over the fitted sets. Its own noise, smaller by the root of their number, is not in any sigma. Raises
+    UsageError when it has no fitted set of a side, or other stations.
     """
     if reference is None:
         return dict(fits)
     if isinstance(reference, Window):
         return _from_window(fits, reference)
-    return _from_file(fits, reference / SHAPE if reference.is_dir() else reference)
+    path = reference / SHAPE if reference.is_dir() else reference
+    table = read_table(path, ())
+    if "marker" in table.column_names:
+        return _from_markers(fits, table, path, wing)
+    return _from_shapes(fits, table, path)
 
 
 def _from_window(fits: Mapping[str, SideFits], window: Window) -> dict[str, SideFits]:
@@ -63,8 +51,20 @@ def _from_window(fits: Mapping[str, SideFits], window: Window) -> dict[str, Side
     return referred
 
 
-def _from_file(fits: Mapping[str, SideFits], path: Path) -> dict[str, SideFits]:
-    shapes = shape_series(read_table(path, ()), str(path))
+def _from_markers(fits: Mapping[str, SideFits], table: pa.Table, path: Path, wing: Wing) -> dict[str, SideFits]:
+    at_rest = fit_series(marker_series(table, str(path)), wing, workers=1)
+    referred = {}
+    for side, own in fits.items():
+        if side not in at_rest or not at_rest[side].converged.any():
+            reason = at_rest[side].reason[0] if side in at_rest else "it has none of its markers"
+            raise UsageError(f"{path}: the {side} wing at rest could not be fitted ({reason})")
+        there = at_rest[side]
+        referred[side] = _referred(own, there.xyz_m[there.converged], there.twist_rad[there.converged], f"{path}")
+    return referred
+
+
+def _from_shapes(fits: Mapping[str, SideFits], table: pa.Table, path: Path) -> dict[str, SideFits]:
+    shapes = shape_series(table, str(path))
     referred = {}
     for side, own in fits.items():
         if side not in shapes:

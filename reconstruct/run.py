@@ -66,7 +66,9 @@ def run_job(job: Job, progress: Progress) -> tuple[dict[str, Any], tuple[str, ..
         done += count
         progress("fit", done, total)
 
-    fits = refer(fit_series(series, wing, smooth_s=job.smooth_s, workers=job.workers, progress=fitted), job.reference)
+    fits = refer(
+        fit_series(series, wing, smooth_s=job.smooth_s, workers=job.workers, progress=fitted), job.reference, wing
+    )
     fit_end = time.monotonic()
     _write_tables(job, table, fits, inputs)
     written = time.monotonic()
