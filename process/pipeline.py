@@ -17,7 +17,6 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from capture.errors import ProcessError
 from process.bulb import centres_m, wing_normals
@@ -25,6 +24,7 @@ from process.camera_model import MarkerLayout, Rig, RigSide
 from process.detect import Detections, DetectSettings, detect
 from process.match import UNSEEN, Matches, MatchSettings, Track, match
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
+from process.set_time import marker_instants_ns, ptp_state, set_instant_ns, time_sigma_ns
 from process.tables import MARKER_SCHEMA
 from process.triangulate import triangulate_as
 from process.workers import one_blas_thread
@@ -256,7 +256,7 @@ def _append(
     numbers = {"xyz": np.full((count, 3), np.nan), "cov": np.full((count, 3, 3), np.nan)}
     epipolar_px = np.full(count, np.nan)
     flags = ["no_frame" if found is None else "not_seen"] * count
-    frame_ns = _frame_timestamp_ns(frames, side)
+    frame_ns = set_instant_ns(frames, side)
     timestamps_ns = np.full(count, frame_ns, dtype=np.int64)
     if found is not None and rows.size:
         spots = matched.spot0[rows], matched.spot1[rows]
@@ -268,7 +268,7 @@ def _append(
             normals = wing_normals(frames.side, layout, numbers["xyz"])
             numbers["xyz"][rows] = centres_m(side, layout.light, points.xyz_m, normals[rows])
         epipolar_px[rows] = points.epipolar_px
-        timestamps_ns[rows] = _marker_timestamps_ns(frames, side, pixels[0, rows, 1], pixels[1, rows, 1])
+        timestamps_ns[rows] = marker_instants_ns(frames, side, pixels[0, rows, 1], pixels[1, rows, 1])
         for row, spot0, spot1, reason in zip(rows, *spots, points.reasons, strict=True):
             said = {reason, *found[0].flags[spot0].split(","), *found[1].flags[spot1].split(",")}
             said |= {"ambiguous"} if matched.ambiguous[row] else set()
@@ -279,6 +279,8 @@ def _append(
     columns["marker"].append(np.arange(count, dtype=np.int32))
     columns["timestamp_ns"].append(timestamps_ns)
     columns["frame_timestamp_ns"].append(np.full(count, frame_ns, dtype=np.int64))
+    columns["time_sigma_ns"].append(np.full(count, time_sigma_ns(frames)))
+    columns["ptp_state"].append(np.full(count, ptp_state(frames)))
     for k, axis in enumerate("xyz"):
         columns[f"{axis}_m"].append(numbers["xyz"][:, k])
         for m in range(k, 3):
@@ -288,40 +290,6 @@ def _append(
         columns[f"v{camera}_px"].append(pixels[camera, :, 1])
     columns["epipolar_px"].append(epipolar_px)
     columns["flags"].append(np.array(flags, dtype=object))
-
-
-def _row_times_ns(frames: FrameSet, side: RigSide) -> tuple[float, float]:
-    """Of each camera: as recorded, or the rig's where the recording does not say."""
-    frame0, frame1 = frames.frames
-    return (
-        side.row_time_ns if frame0 is None else float(frame0.row_time_ns),
-        side.row_time_ns if frame1 is None else float(frame1.row_time_ns),
-    )
-
-
-def _frame_timestamp_ns(frames: FrameSet, side: RigSide) -> int:
-    """Mid-exposure of the middle row, mean of the cameras that have a frame."""
-    moments = [
-        moment + round((camera.height - 1) / 2 * row_time)
-        for moment, camera, row_time in zip(
-            frames.mid_exposures_ns, (side.pair.cam0, side.pair.cam1), _row_times_ns(frames, side), strict=True
-        )
-        if moment is not None
-    ]
-    return sum(moments) // len(moments)
-
-
-def _marker_timestamps_ns(
-    frames: FrameSet, side: RigSide, v0_px: NDArray[np.float64], v1_px: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Mid-exposure of each marker's own row, mean of both cameras. Whole nanoseconds: UTC does not fit a float64."""
-    moment0, moment1 = frames.mid_exposures_ns
-    assert moment0 is not None
-    assert moment1 is not None
-    row_time0, row_time1 = _row_times_ns(frames, side)
-    rows_ns = (v0_px * row_time0 + v1_px * row_time1) / 2.0
-    apart_ns = moment1 - moment0
-    return np.rint(rows_ns + apart_ns / 2.0).astype(np.int64) + moment0
 
 
 def _table(whole: _Block) -> pa.Table:

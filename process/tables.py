@@ -20,6 +20,8 @@ MARKER_SCHEMA: pa.Schema = pa.schema(
         ("marker", pa.int32()),
         ("timestamp_ns", pa.int64()),
         ("frame_timestamp_ns", pa.int64()),
+        ("time_sigma_ns", pa.float64()),
+        ("ptp_state", pa.string()),
         *((f"{axis}_m", pa.float64()) for axis in "xyz"),
         *((f"cov_{axes}_m2", pa.float64()) for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
         *((name, pa.float64()) for name in ("u0_px", "v0_px", "u1_px", "v1_px", "epipolar_px")),
@@ -43,7 +45,7 @@ SHAPE_SCHEMA: pa.Schema = pa.schema(
 )
 """columns of ``shape.parquet``"""
 
-_TRUTH_MAY_LACK = ("cov_", "sigma_", "u0_", "v0_", "u1_", "v1_", "epipolar_", "flags")
+_TRUTH_MAY_LACK = ("time_sigma_", "ptp_", "cov_", "sigma_", "u0_", "v0_", "u1_", "v1_", "epipolar_", "flags")
 
 
 def write_table(table: pa.Table, path: Path | str, *, command: str, inputs: Iterable[Path] = ()) -> None:
