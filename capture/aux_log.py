@@ -36,7 +36,7 @@ class Companion(Protocol):
         """Begin. A companion that cannot begin says so in its statuses; it never stops a recording."""
 
     def statuses(self) -> list[Diagnostic]:
-        """How it is doing, asked once a second. Must not block."""
+        """How it is doing, asked a few times a second by one thread at a time. Must not block."""
 
     def stop(self) -> None:
         """End; no message after this returns. Safe to call twice."""

@@ -20,6 +20,7 @@ from capture.console import Narrator, run, say, say_json
 from capture.daemon import Recording, RecordingResult, StopRule
 from capture.disk import SystemDisk
 from capture.errors import CaptureError, UsageError
+from capture.health_writer import HealthWriter
 from capture.preflight import Finding, Situation
 from capture.preflight import preflight as run_checks
 from capture.recover import recover_flight
@@ -49,9 +50,10 @@ def record(
         signal.signal(number, lambda *_: requested.set())
     narrator = Narrator()
     loaded, clock = load_config(config), SystemClock()
-    recording = Recording(loaded, clock, SystemDisk(), narrator, make_companions(loaded.config, clock))
-    narrator(f"recording {recording.flight}")
-    result = recording.run(StopRule(requested, triggers, duration))
+    with HealthWriter(loaded.config, clock, narrator) as health:
+        recording = Recording(loaded, clock, SystemDisk(), narrator, make_companions(loaded.config, clock), health)
+        narrator(f"recording {recording.flight}")
+        result = recording.run(StopRule(requested, triggers, duration))
     narrator.close()
     if json:
         say_json(result.as_dict())

@@ -14,6 +14,8 @@ from capture.camera.base import CameraSettings
 from capture.errors import ConfigError
 from capture.trigger_protocol import MAX_CHANNELS
 
+MAX_PREVIEW_HZ = 2.0  # a preview is a copy of a whole frame
+
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -55,6 +57,13 @@ class RingConfig(_Table):
 
     stall_s: Annotated[float, Field(gt=0, le=60)] = 2.0
     lock_memory: bool = True
+
+
+class HealthConfig(_Table):
+    """Where the recorder's health is shared with those who watch, and how often frames are shown."""
+
+    folder: Path | None = None  # None: capture.health.default_folder
+    preview_hz: Annotated[float, Field(ge=0, le=MAX_PREVIEW_HZ)] = MAX_PREVIEW_HZ  # a camera; 0: none
 
 
 class CameraDefaults(_Table):
@@ -134,6 +143,7 @@ class Config(_Table):
     camera: CameraDefaults
     cameras: Annotated[list[CameraPlace], Field(min_length=1, max_length=4)]
     ring: RingConfig = RingConfig()
+    health: HealthConfig = HealthConfig()
     ptp: PtpConfig | None = None
     flight: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     calibration: Path | None = None
@@ -201,6 +211,9 @@ def load_config(path: Path) -> LoadedConfig:
     left, right = (folder / disk.expanduser() for disk in (config.disks.left, config.disks.right))
     if left.resolve() == right.resolve():
         raise ConfigError(f"{path}: `disks.left` and `disks.right` are the same folder: give each side one of its own")
+    health = config.health
+    if health.folder is not None:
+        health = health.model_copy(update={"folder": folder / health.folder.expanduser()})
     disks = config.disks.model_copy(update={"left": left, "right": right})
     calibration = folder / config.calibration if config.calibration else None
     if calibration is not None and not calibration.is_file():
@@ -209,7 +222,7 @@ def load_config(path: Path) -> LoadedConfig:
             "or remove the key `calibration`"
         )
     carried = calibration.read_bytes() if calibration else None
-    config = config.model_copy(update={"disks": disks, "calibration": calibration})
+    config = config.model_copy(update={"disks": disks, "calibration": calibration, "health": health})
     return LoadedConfig(config, text, hashlib.sha256(raw).hexdigest(), carried)
 
 

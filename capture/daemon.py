@@ -4,7 +4,7 @@ import contextlib
 import datetime
 import json
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from capture.disk import Disk
 from capture.errors import CameraError, DiskError, TriggerBoardError
 from capture.flight import metadata_yaml
 from capture.grabber import Grabber
+from capture.health_writer import HealthWriter
 from capture.lane import Lane, LaneParts, check_ring_memory, make_lane
 from capture.ledger import CameraAccount, Ledger, Place
 from capture.provenance import describe_cameras, describe_config, describe_host, describe_time
@@ -27,6 +28,7 @@ from capture.record import SIDES, Diagnostic, Trigger
 from capture.recorder import Recorder
 from capture.trigger import BoardCount, TriggerBoard, TriggerLog
 from capture.trigger_protocol import Pulse
+from capture.vitals import Vitals
 from capture.worker import share_interpreter
 
 CONTROL_PERIOD_S = 0.1
@@ -107,6 +109,7 @@ class Recording:
         disk: Disk,
         progress: Callable[[str], None],
         companions: Sequence[Companion] = (),
+        health: HealthWriter | None = None,
     ) -> None:
         self._disk = disk
         self._loaded = loaded
@@ -130,6 +133,8 @@ class Recording:
         self._flight_id = f"{self.flight}-{clock.utc_ns():x}"
         places = [(camera.side, camera.name) for camera in self._config.cameras]
         self._ledger = Ledger(places, self._config.trigger.first_index, clock.utc_ns, self._aux.loss)
+        self._vitals = Vitals(self.flight, self._config, self._ledger, clock, self._companions, self._failures)
+        self._health = health
 
     def run(self, stop: StopRule) -> RecordingResult:
         """Record until told to stop, then account for everything and close.
@@ -140,6 +145,7 @@ class Recording:
         """
         share_interpreter()
         with contextlib.ExitStack() as cleanup:
+            cleanup.enter_context(self._watched())
             self._open_cameras(cleanup)
             on_sample = self._analog.take if self._analog is not None else None
             board = TriggerBoard(self._config.trigger.port, self._clock, self._on_pulse, on_sample)
@@ -149,6 +155,7 @@ class Recording:
             before = board.end()  # it may still be running for a recorder that was killed
             board.set_rate(self._config.trigger.rate_hz)
             self._make_lanes(name)
+            self._show_frames()
             self._counter_before = before.counter
             started_s = self._clock.monotonic_s()
             try:
@@ -159,14 +166,38 @@ class Recording:
                 for lane in self._lanes.values():
                     lane.start()
                 board.begin(self._config.trigger.first_index, stop.triggers)
+                self._vitals.begin(self._lanes)
                 self._control(board, stop, started_s)
             except Exception as error:  # whatever it is: what was recorded is closed and accounted for
                 self._failures.append(f"{type(error).__name__}: {error}")
+            self._vitals.state = "stopping"
             count = self._end_triggers(board)
             for companion in self._companions:
                 companion.stop()
             seconds = self._clock.monotonic_s() - started_s
             return self._finish(before, count, seconds, board)
+
+    @contextlib.contextmanager
+    def _watched(self) -> Iterator[None]:
+        """Share the health of all that is done within."""
+        if self._health is None:
+            yield
+            return
+        self._health.source = self._vitals.snapshot
+        try:
+            yield
+        except Exception as error:
+            self._failures.append(str(error))
+            raise
+        finally:
+            self._vitals.state = "ended"
+            self._health.hide()
+
+    def _show_frames(self) -> None:
+        previews = self._health.show(self._cameras) if self._health is not None else None
+        if previews is not None:
+            for recorder in self._recorders.values():
+                recorder.tap = previews.offer
 
     @property
     def _grabbers(self) -> dict[Place, Grabber]:
@@ -399,35 +430,12 @@ class Recording:
                 recorder.put_aux(messages)
 
     def _report(self) -> None:
-        accounts = self._ledger.accounts()
-        statuses = [
-            Diagnostic(
-                1 if account.lost_total else 0,
-                "/".join(place),
-                "frames lost" if account.lost_total else "recording",
-                (
-                    ("recorded", str(account.recorded)),
-                    ("lost", json.dumps(account.lost)),
-                    ("ring_in_use", str(self._grabbers[place].ring.in_use)),
-                ),
-            )
-            for place, account in accounts.items()
-        ]
-        statuses += [
-            Diagnostic(
-                2 if recorder.failure or recorder.moved else 0,
-                f"disk {side}",
-                str(recorder.failure or recorder.moved or recorder.write_mode),
-                (("queued", str(recorder.queued)), ("last_write_us", str(recorder.statistics.last_us))),
-            )
-            for side, recorder in self._recorders.items()
-        ]
-        for companion in self._companions:
-            statuses += companion.statuses()
+        health = self._vitals.snapshot()
+        statuses = (Diagnostic(n.level, n.name, n.message, tuple(n.values.items())) for n in health.diagnostics)
         self._aux.diagnostics(tuple(statuses))
-        recorded = sum(account.recorded for account in accounts.values())
-        lost = sum(account.lost_total for account in accounts.values())
-        depth = max(grabber.ring.in_use for grabber in self._grabbers.values())
+        recorded = sum(camera.recorded for camera in health.cameras)
+        lost = sum(camera.lost_total for camera in health.cameras)
+        depth = max((camera.ring_in_use for camera in health.cameras), default=0)
         self._progress(
             f"triggers {self._triggers_so_far()}  recorded {recorded}  lost {lost}  "
             f"ring {depth}/{self._config.ring_slots}"

@@ -22,8 +22,8 @@ class SideGate:
     """Keeps stereo sets whole: the first camera of a side to get a trigger's frame decides for both.
 
     A set is let in when every ring of the side has a slot that is not promised yet; one is then promised to each
-    camera. Otherwise both frames are lost at the ring. A promise ends when its camera takes the slot, or shows a later
-    frame.
+    camera. Otherwise both frames are lost at the ring. A promise ends when its camera takes the slot, shows a later
+    frame, or can no longer have the frame: a driver holds no more than ``DRIVER_BUFFERS``.
     """
 
     _REMEMBERED = 64
@@ -47,6 +47,8 @@ class SideGate:
             return ring.take()
 
     def _decide(self, index: int) -> None:
+        for promised in self._promised.values():  # a camera that is gone must not starve the other
+            promised -= {old for old in promised if old < index - DRIVER_BUFFERS}
         room = all(ring.free > len(self._promised[id(ring)]) for ring in self._rings)
         self._decisions[index] = room
         if room:

@@ -18,7 +18,7 @@ from capture.ptp_protocol import identity_text
 def describe_host() -> dict[str, str]:
     """Program and computer."""
     return {
-        "version": _version(),
+        "version": software_version(),
         "commit": _commit(),
         "host": platform.node(),
         "kernel": platform.release(),
@@ -66,7 +66,8 @@ def _kernel_tai() -> dict[str, str]:
     return {"tai_offset_s": str(offset_s), "tai_offset_source": "kernel"}
 
 
-def _version() -> str:
+def software_version() -> str:
+    """The distribution's version."""
     try:
         return version("wingshape")
     except PackageNotFoundError:

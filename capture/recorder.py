@@ -2,7 +2,7 @@
 
 import queue
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -83,6 +83,7 @@ class WriteStatistics:
 
     frames: int = 0
     last_us: int = 0
+    free_bytes: int | None = None  # of the disk, when last asked
     latencies_us: deque[int] = field(default_factory=lambda: deque(maxlen=100_000))
 
 
@@ -113,6 +114,7 @@ class Recorder(Worker):
         self.segments: list[SegmentWriter] = []
         self.aux_dropped = 0
         self.write_mode: str = config.write
+        self.tap: Callable[[FrameItem], bool] | None = None  # may take over the slot of a frame that is done with
         self._cameras = tuple(cameras)
         self._size = size
         self._config = config
@@ -187,7 +189,8 @@ class Recorder(Worker):
             self._ledger.recorded(item.place, item.index)
         else:
             self._ledger.lost(item.place, item.index, LossStage.DISK, str(self.failure))
-        item.ring.give_back(item.slot)
+        if self.tap is None or not self.tap(item):
+            item.ring.give_back(item.slot)
 
     def _write_somewhere(self, item: FrameItem) -> bool:
         """On this side's disk, or once more on the other where that one takes over."""
@@ -269,9 +272,11 @@ class Recorder(Worker):
 
     def _guard_space(self) -> None:
         try:
-            free_mb = self._disk.free_bytes(self.folder) / 1e6
+            free_bytes = self._disk.free_bytes(self.folder)
         except OSError as error:
             raise DiskError(f"{self.folder}: the disk is gone ({error.strerror}): check its connection") from error
+        self.statistics.free_bytes = free_bytes
+        free_mb = free_bytes / 1e6
         if free_mb < self._config.reserve_mb:
             raise DiskError(
                 f"{self.folder}: {free_mb:.0f} MB free is less than the reserve of {self._config.reserve_mb:.0f} MB: "

@@ -67,6 +67,7 @@ class SealedFrame:
     """A slot that is ready for the disk, and what the file's index needs to know of it."""
 
     slot: memoryview
+    pixels: memoryview
     log_ns: int
     publish_ns: int
     chunk_at: int
@@ -133,6 +134,7 @@ class FrameLayout:
         _pad(slot, self._tail_at, self.slot_bytes)
         return SealedFrame(
             slot=slot[: self.slot_bytes],
+            pixels=self.pixels(slot),
             log_ns=log_ns,
             publish_ns=publish_ns,
             chunk_at=self._chunk_at,

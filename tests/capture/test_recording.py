@@ -97,6 +97,15 @@ def test_an_unplugged_camera_leaves_the_others_without_a_gap(write_config, rig, 
     assert inspect([tmp_path]).problems == []
 
 
+def test_a_camera_that_is_gone_for_long_does_not_starve_the_other_of_its_side(write_config, rig, tmp_path):
+    """Slots that were promised to it are free again: more triggers follow than the ring has slots."""
+    rig.unplugged_at = {"right_cam1": 10}
+    rig.missed = {("left_cam0", index) for index in range(10, 200)}
+    result = record(write_config(rate_hz=100), triggers=200)
+    recorded = {"/".join(place): account.recorded for place, account in result.accounts.items()}
+    assert recorded == {"left/cam0": 10, "left/cam1": 200, "right/cam0": 200, "right/cam1": 10}
+
+
 def test_silent_and_garbled_pulses_do_not_move_the_numbering(write_config, rig, tmp_path, pixels_of):
     rig.silent_pulses = {6}
     rig.garbled_pulses = {12}
