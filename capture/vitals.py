@@ -88,7 +88,7 @@ class Vitals:
             notices = [self._recorder_notice(), self._board_notice(sample)]
             notices += [notice for _, notice in (*cameras, *disks)]
             for companion in self._companions:
-                notices += [Notice(d.level, d.name, d.message, dict(d.values)) for d in companion.statuses()]
+                notices += _notices_of(companion)
             started_s = sample.at_s if self._started_s is None else self._started_s
             return Health(
                 flight=self._flight,
@@ -251,6 +251,13 @@ class Vitals:
         ]
         rings = [grabber.ring for lane in here for grabber in lane.grabbers.values()]
         return sum(ring.slot_bytes for ring in rings) * self._config.trigger.rate_hz
+
+
+def _notices_of(companion: Companion) -> list[Notice]:
+    try:
+        return [Notice(d.level, d.name, d.message, dict(d.values)) for d in companion.statuses()]
+    except Exception as error:  # its defect must not end the recording
+        return [Notice(ERROR, type(companion).__name__, f"cannot say how it is doing: {error!r}")]
 
 
 def _arrived(account: CameraAccount) -> int:

@@ -55,6 +55,9 @@ class Companion:
     def statuses(self) -> list[Diagnostic]:
         return self.said
 
+    def account(self) -> dict[str, str]:
+        return {}
+
     def stop(self) -> None: ...
 
 
