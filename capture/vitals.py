@@ -8,15 +8,15 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
-from capture.aux_log import Companion
 from capture.clock import Clock
 from capture.config import Config
 from capture.grabber import Grabber
 from capture.health import ERROR, OK, WARNING, CameraHealth, DiskHealth, Health, Notice
 from capture.lane import Lane
 from capture.ledger import CameraAccount, Ledger, Place
-from capture.record import LossStage
+from capture.record import Diagnostic, LossStage
 from capture.recorder import Recorder
 
 WINDOW_S = 10.0  # losses are judged over this
@@ -28,6 +28,13 @@ RING_BEHIND_SHARE = 0.5
 MINUTES_LOW, MINUTES_LEAST = 10.0, 2.0
 RUNNING = ("armed", "recording")
 _AFTER_ARRIVAL = tuple(stage.name.lower() for stage in (LossStage.RING, LossStage.WRITER, LossStage.DISK))
+
+
+class Reporter(Protocol):
+    """A companion, as far as it concerns us."""
+
+    def statuses(self) -> list[Diagnostic]:
+        """How it is doing. Must not block."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,7 @@ class Vitals:
         config: Config,
         ledger: Ledger,
         clock: Clock,
-        companions: Sequence[Companion] = (),
+        companions: Sequence[Reporter] = (),
         failures: Sequence[str] = (),
     ) -> None:
         self.state = "starting"
@@ -253,7 +260,7 @@ class Vitals:
         return sum(ring.slot_bytes for ring in rings) * self._config.trigger.rate_hz
 
 
-def _notices_of(companion: Companion) -> list[Notice]:
+def _notices_of(companion: Reporter) -> list[Notice]:
     try:
         return [Notice(d.level, d.name, d.message, dict(d.values)) for d in companion.statuses()]
     except Exception as error:  # its defect must not end the recording
