@@ -96,8 +96,12 @@ class PtpPair:
         )
         own = self.folder / "pmc"
         command = [needs_program("pmc"), "-u", "-b", "0", "-i", str(own), "-s", str(self.master_socket), words]
-        answer = subprocess.run(command, check=True, capture_output=True, text=True)
-        assert "RESPONSE" in answer.stdout, answer.stdout
+        for _ in range(20):  # one that has just been started is not listening yet
+            answer = subprocess.run(command, check=False, capture_output=True, text=True)
+            if "RESPONSE" in answer.stdout:
+                return
+            time.sleep(0.1)
+        raise AssertionError(answer.stdout + answer.stderr)
 
     def log(self, role: str) -> str:
         """What that ptp4l said."""
