@@ -3,6 +3,9 @@
 import time
 from typing import Protocol
 
+EARLIEST_NS = 1_735_689_600_000_000_000
+"""2025-01-01 UTC: a clock before it was never set."""
+
 
 class Clock(Protocol):
     """Time as the recorder sees it; simulated in the fault tests."""

@@ -5,8 +5,8 @@ measurements are the trigger times that the board reported. How noisy those are 
 much the rate wanders nobody knows beforehand (temperature): four filters run beside each other, each with its own
 idea of it, and are weighted by how well they have predicted (Magill, 1965, multiple model estimation).
 
-A receive time is late by what the link took: never less than a floor, often much more. The least of a block of frames is
-near the floor. While triggers are reported the floor is learned; while they are not, it carries the fit on.
+A receive time is late by what the link took: never less than a floor, often much more. The least of a block of
+frames is near the floor. While triggers are reported the floor is learned; while they are not, it carries the fit on.
 
 Plain numbers, no arrays: a frame costs about 12 µs in the read thread, and memory is bounded.
 """

@@ -18,6 +18,7 @@ from capture.config import Config, LoadedConfig
 from capture.disk import Disk
 from capture.errors import CameraError, DiskError, TriggerBoardError
 from capture.flight import metadata_yaml
+from capture.gates import Gates, judge_cameras, judge_clock
 from capture.grabber import Grabber
 from capture.health_writer import HealthWriter
 from capture.lane import Lane, LaneParts, check_ring_memory, make_lane
@@ -125,8 +126,9 @@ class Recording:
         ptp = self._config.ptp
         self._ptp = PtpWatch(ptp, clock) if ptp is not None and ptp.role != "none" else None
         self._analog = AnalogLog(self._config.analog, clock) if self._config.analog is not None else None
+        self._gates = Gates(clock)
         own = [companion for companion in (self._ptp, self._analog) if companion is not None]
-        self._companions = (*own, *companions)
+        self._companions = (*own, *companions, self._gates)
         self._failures: list[str] = []
         self._counter_before: int | None = None  # the board's, before our first pulse
         self._pulse_s = 0.0  # when the last pulse was reported
@@ -245,6 +247,7 @@ class Recording:
             lock_memory=self._config.ring.lock_memory,
             calibration=self._calibration(),
             clock_state=self._ptp.now if self._ptp else lambda: FREE_RUNNING,
+            trigger_latency_ns=round(self._config.camera.trigger_latency_us * 1e3),
         )
         camera = self._config.camera
         check_ring_memory(len(self._cameras), self._config.ring_slots, camera.width, camera.height)
@@ -430,6 +433,9 @@ class Recording:
                 recorder.put_aux(messages)
 
     def _report(self) -> None:
+        judge_clock(self._gates, self._clock)
+        clocks = {"/".join(place): grabber.clock for place, grabber in self._grabbers.items()}
+        judge_cameras(self._gates, clocks, self._config.camera.time_sigma_limit_us)
         health = self._vitals.snapshot()
         statuses = (Diagnostic(n.level, n.name, n.message, tuple(n.values.items())) for n in health.diagnostics)
         self._aux.diagnostics(tuple(statuses))

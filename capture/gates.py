@@ -1,10 +1,12 @@
 """What should be in order during a recording, to marks with begin and end where it is not."""
 
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from capture.aux_log import Put
-from capture.clock import Clock
+from capture.clock import EARLIEST_NS, Clock
+from capture.clock_fit import ClockFigures
 from capture.record import GATE_TOPIC, Diagnostic, Gate
 
 
@@ -21,6 +23,7 @@ class Gates:
         self._clock = clock
         self._put: Put | None = None
         self._failing: dict[str, _Open] = {}
+        self._marked = 0
         self._mutex = threading.Lock()
 
     def start(self, put: Put) -> None:
@@ -36,6 +39,7 @@ class Gates:
             found = self._failing.get(name)
             if cause is not None and found is None:
                 self._failing[name] = _Open(self._clock.utc_ns(), cause)
+                self._marked += 1
                 self._mark(name, self._failing[name], 0)
             elif cause is None and found is not None:
                 del self._failing[name]
@@ -55,6 +59,10 @@ class Gates:
                 for name, found in self._failing.items()
             ]
 
+    def account(self) -> dict[str, str]:
+        """How often something began to fail."""
+        return {"gates_marked": str(self._marked)}
+
     def stop(self) -> None:
         """The recording ends, and with it every mark. Safe to call twice."""
         for name in self.failing:
@@ -66,3 +74,17 @@ class Gates:
         if self._put is not None:
             at_ns = end_ns or found.begin_ns
             self._put(GATE_TOPIC, at_ns, Gate(found.begin_ns, end_ns, name, found.cause).encode())
+
+
+def judge_clock(gates: Gates, clock: Clock) -> None:
+    """The computer's clock has been set."""
+    gates.judge("clock", None if clock.utc_ns() >= EARLIEST_NS else "the computer's clock was never set: it says 1970")
+
+
+def judge_cameras(gates: Gates, clocks: Mapping[str, ClockFigures], limit_us: float) -> None:
+    """Each camera's instants are known within the limit; ``clocks`` by ``side/name``."""
+    for name, figures in clocks.items():
+        sigma_us = figures.sigma_ns * 1e-3
+        wide = figures.frames > 0 and sigma_us > limit_us
+        cause = f"its frames' instants are known to {sigma_us:.0f} us only, not {limit_us:g} us"
+        gates.judge(f"clock {name}", cause if wide else None)

@@ -1,14 +1,14 @@
 """The read thread of one camera: filled buffers to numbered, sealed frames in the write queue."""
 
 import threading
-from collections.abc import Callable
 
 from capture.camera.base import Camera, CameraDescription, FrameStatus, Grab
+from capture.clock_fit import ClockFigures
 from capture.config import DRIVER_BUFFERS
 from capture.errors import CameraLost
+from capture.frame_clock import FrameClock
 from capture.ledger import Ledger, Place
 from capture.numbering import FrameNumbering, Numbered, Triggers
-from capture.ptp import ClockState
 from capture.record import Frame, LossStage
 from capture.recorder import FrameItem, Recorder
 from capture.ring import Ring
@@ -72,7 +72,7 @@ class Grabber(Worker):
         triggers: Triggers,
         ledger: Ledger,
         recorder: Recorder,
-        clock_state: Callable[[], ClockState],
+        frame_clock: FrameClock,
     ) -> None:
         super().__init__(f"read-{place[0]}-{place[1]}")
         self.place = place
@@ -84,8 +84,13 @@ class Grabber(Worker):
         self._gate = gate
         self._ledger = ledger
         self._recorder = recorder
-        self._clock_state = clock_state
+        self._frame_clock = frame_clock
         self._numbering = FrameNumbering(description, triggers)
+
+    @property
+    def clock(self) -> ClockFigures:
+        """How well the camera's clock is known."""
+        return self._frame_clock.figures
 
     def arm(self) -> None:
         """Give the driver its buffers and make the camera ready for triggers. Before ``start``."""
@@ -141,20 +146,21 @@ class Grabber(Worker):
 
     def _hand_over(self, grab: Grab, numbered: Numbered) -> None:
         row_time_ns = self._description.row_time_ns
+        time = self._frame_clock.time_of(grab, numbered)
         frame = Frame(
             trigger_index=numbered.index,
             device_frame_id=grab.frame_id,
             device_ticks=grab.device_ticks,
             trigger_time_ns=numbered.trigger_ns,
-            exposure_start_ns=numbered.trigger_ns,
+            exposure_start_ns=time.exposure_start_ns,
             receive_time_ns=grab.receive_ns,
-            time_sigma_ns=-1,
+            time_sigma_ns=time.sigma_ns,
             exposure_us=grab.exposure_us,
             row_time_ns=row_time_ns,
             ring_depth=self.ring.in_use,
             previous_write_us=self._recorder.statistics.last_us,
             gain_db=grab.gain_db,
-            ptp_state=self._clock_state().ptp_state,
+            ptp_state=time.ptp_state,
             status=grab.status,
         )
         middle_ns = frame.mid_exposure_ns + row_time_ns * (self._description.height - 1) // 2

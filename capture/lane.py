@@ -8,6 +8,7 @@ from capture.camera.base import Camera, CameraDescription
 from capture.clock import Clock
 from capture.config import DiskConfig
 from capture.disk import Disk
+from capture.frame_clock import FrameClock
 from capture.grabber import Grabber, SideGate
 from capture.ledger import Ledger
 from capture.numbering import Triggers
@@ -32,6 +33,7 @@ class LaneParts:
     lock_memory: bool
     calibration: tuple[str, bytes] | None = None  # name and content
     clock_state: Callable[[], ClockState] = lambda: FREE_RUNNING  # of this computer, asked for each frame
+    trigger_latency_ns: int = 0  # from a trigger to the start of row 0's exposure
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def make_lane(
             parts.triggers,
             parts.ledger,
             recorder,
-            parts.clock_state,
+            FrameClock(description, parts.triggers, parts.clock_state, parts.trigger_latency_ns),
         )
         for name, (camera, description) in cameras.items()
     }

@@ -20,6 +20,9 @@ class Triggers(Protocol):
     def latest_before(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
         """Index and time of the last trigger at or before ``time_ns``."""
 
+    def reported(self, index: int) -> bool:
+        """Whether the board itself has said when it gave this trigger."""
+
 
 CONFIRMING = 4
 """Frames that must agree before the first one is believed to know its trigger."""

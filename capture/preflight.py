@@ -8,15 +8,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from capture.clock import Clock
+from capture.clock import EARLIEST_NS, Clock
 from capture.config import Config
 from capture.errors import CaptureError
 from capture.ptp import POLL_S, PtpWatch
 from capture.trigger import TriggerBoard
-
-EARLIEST_NS = 1_735_689_600_000_000_000
-"""2025-01-01: a clock before it was never set."""
-
 
 PTP_REMEDIES = {
     "ptp.answers": "see `journalctl -u ptp4l`",

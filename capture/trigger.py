@@ -79,6 +79,12 @@ class TriggerLog:
             steps = found[0] - 1 - self._indices[before]
             return found[0] - 1, self._times_ns[before] + steps * self.period_ns
 
+    def reported(self, index: int) -> bool:
+        """Whether the board itself has said when it gave this trigger."""
+        with self._changed:
+            k = bisect.bisect_left(self._indices, index)
+            return k < len(self._indices) and self._indices[k] == index
+
     def _reported_until(self, time_ns: int) -> bool:
         return bool(self._times_ns) and self._times_ns[-1] > time_ns - self.period_ns // 2
 

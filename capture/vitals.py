@@ -181,6 +181,7 @@ class Vitals:
             **{f"lost_{stage}": str(count) for stage, count in health.lost.items()},
             "rate_hz": str(health.rate_hz),
             "ring_in_use": str(health.ring_in_use),
+            **{f"clock_{key}": str(value) for key, value in vars(grabber.clock).items()},
         }
         return health, Notice(level, health.place, message, values)
 
