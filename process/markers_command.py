@@ -23,9 +23,18 @@ from process.match import MatchSettings
 from process.pipeline import MarkersResult, PipelineSettings
 from process.pipeline import markers as run_pipeline
 from process.shared_error import with_rig
+from process.signal_table import MAX_GAP_S, sets_of, signal_table, signals_path
+from process.signals import read_signals
 from process.tables import write_table
 
 SHOWN_PROBLEMS = 20
+
+DbcOption = Annotated[
+    list[Path] | None, typer.Option(help="DBC file that names the signals in the recorded CAN frames; can be repeated.")
+]
+MaxGapOption = Annotated[
+    float, typer.Option(min=0.0, help="Longest gap between samples, in seconds, that signals are interpolated over.")
+]
 
 
 class Detection(StrEnum):
@@ -63,10 +72,15 @@ def markers(
     triangulation: Annotated[
         Triangulation, typer.Option(help="Least reprojection error, or the paper's matrix Q.")
     ] = Triangulation.default,
+    dbc: DbcOption = None,
+    max_gap: MaxGapOption = MAX_GAP_S,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; up to one a core if not given.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Measure the markers: frames to 3-D positions in the body frame, with covariances and times."""
+    """Measure the markers: frames to 3-D positions in the body frame, with covariances and times.
+
+    What was recorded beside the frames (CAN, analog, MAVLink) goes to OUTPUT_signals.parquet, at the frames' instants.
+    """
     if output.resolve() == rig.resolve():
         raise UsageError(f"{output}: the table would overwrite the rig file; name another output")
     if not output.resolve().parent.is_dir():
@@ -77,17 +91,24 @@ def markers(
         triangulation.value,
     )
     cameras = Rig.read(rig)
+    signals = read_signals(flight, dbc or ())
     with _progress() as progress:
         result = run_pipeline(flight, cameras, settings, progress, workers)
-    write_table(with_rig(result.table, cameras), output, command=shlex.join(["wingproc", *sys.argv[1:]]), inputs=[rig])
-    summary = summarise(result)
+    command = shlex.join(["wingproc", *sys.argv[1:]])
+    write_table(with_rig(result.table, cameras), output, command=command, inputs=[rig])
+    beside = signal_table(sets_of(result.table), signals, max_gap)
+    write_table(beside, signals_path(output), command=command, inputs=dbc or ())
+    summary = summarise(result) | {"signals": [signal.name for signal in signals.signals]}
+    problems = (*result.problems, *signals.problems)
     if json:
-        say_json({**summary, "problems": list(result.problems), "output": str(output)})
+        say_json(
+            {**summary, "problems": list(problems), "output": str(output), "output_signals": str(signals_path(output))}
+        )
         return
-    for problem in result.problems[:SHOWN_PROBLEMS]:
+    for problem in problems[:SHOWN_PROBLEMS]:
         note(f"warning: {problem}")
-    if len(result.problems) > SHOWN_PROBLEMS:
-        note(f"warning: and {len(result.problems) - SHOWN_PROBLEMS} more")
+    if len(problems) > SHOWN_PROBLEMS:
+        note(f"warning: and {len(problems) - SHOWN_PROBLEMS} more")
     _print(summary, output)
 
 
@@ -122,6 +143,8 @@ def _print(summary: dict[str, Any], output: Path) -> None:
     for title, counts in (("flags", summary["flags"]), ("turned down", summary["rejected_blobs"])):
         if counts:
             say(f"{title:<15} " + ", ".join(f"{reason} {count}" for reason, count in counts.items()))
+    if summary["signals"]:
+        say(f"signals         {len(summary['signals'])}: {', '.join(summary['signals'])}")
     say(f"rate            {summary['frame_sets_per_s']:.1f} frame sets/s ({summary['seconds']:.1f} s)")
     say(f"written         {output}")
 
