@@ -258,6 +258,17 @@ class MarkerLayout:
         )
 
 
+@dataclass(frozen=True)
+class ReferenceLight:
+    """A light on the fuselage, seen in flight too: it tells whether the cameras stay where they are."""
+
+    name: str
+    xyz_m: tuple[float, float, float]
+    """surveyed, body frame"""
+    sigma_m: float
+    """of each coordinate"""
+
+
 @dataclass(frozen=True, eq=False)
 class RigSide:
     """One wing's camera pair as mounted.
@@ -274,6 +285,7 @@ class RigSide:
     row_time_ns: float
     pose_covariance: Array | None = None
     pose_by_calibration: Array | None = None
+    references: tuple[ReferenceLight, ...] = ()
 
     def __post_init__(self) -> None:
         _freeze(self, "T_body_cam0", self.T_body_cam0, (4, 4))
@@ -291,6 +303,7 @@ class RigSide:
             "cam0_serial": self.cam0_serial,
             "cam1_serial": self.cam1_serial,
             "row_time_ns": self.row_time_ns,
+            "references": [asdict(light) for light in self.references],
             "pair": self.pair.to_dict(),
         }
 
@@ -304,6 +317,10 @@ class RigSide:
             float(value["row_time_ns"]),
             value["pose_covariance"],
             value.get("pose_by_calibration"),
+            tuple(
+                ReferenceLight(str(light["name"]), tuple(light["xyz_m"]), float(light["sigma_m"]))
+                for light in value.get("references", [])
+            ),
         )
 
 

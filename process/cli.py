@@ -8,11 +8,13 @@ from process.calibrate_command import calibrate
 from process.markers_command import markers
 from process.plan_command import plan
 from process.reference_command import reference
+from process.repose_command import repose
 from process.rig_command import rig
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="From recorded frames to 3-D markers.")
 app.command()(calibrate)
 app.command()(rig)
+app.command()(repose)
 app.command()(reference)
 app.command()(markers)
 app.command()(accuracy)

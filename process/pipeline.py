@@ -22,6 +22,7 @@ from capture.errors import ProcessError
 from process.bulb import centres_m, wing_normals
 from process.camera_model import MarkerLayout, Rig, RigSide
 from process.detect import Detections, DetectSettings, detect
+from process.flight_cameras import check_cameras
 from process.match import UNSEEN, Matches, MatchSettings, Track, match
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
 from process.set_time import marker_instants_ns, ptp_state, set_instant_ns, time_sigma_ns
@@ -98,6 +99,7 @@ def markers_of_recording(
     workers: int | None = None,
 ) -> MarkersResult:
     """``markers`` of a recording that is open already."""
+    check_cameras(recording.files, rig)
     began = time.monotonic()
     blocks = list(_blocks(recording))
     total = sum(len(block) for block in blocks)

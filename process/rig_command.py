@@ -7,15 +7,18 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from capture.console import note, say, say_json
 from capture.errors import ProcessError
 from process.board import read_grey
-from process.camera_model import Light, MarkerLayout, Rig, RigSide, StereoPair, read_pair
+from process.camera_model import Light, MarkerLayout, ReferenceLight, Rig, RigSide, StereoPair, read_pair
 from process.detect import Detections, detect
 from process.json_file import finite_or_none, provenance
 from process.rig import PoseFit, approximate_pose, solve_pose
 from process.survey import Survey, SurveySide, read_survey
+
+Array = NDArray[np.float64]
 
 
 def rig(
@@ -47,26 +50,35 @@ def rig(
         say_json({**summary, "output": str(output)})
         return
     for side in fits:
-        _print(side, summary[side])
+        print_fit(side, summary[side])
     say(f"written  {output}")
 
 
 def locate(pair: StereoPair, side: SurveySide) -> PoseFit:
     """Pose of one pair. ProcessError, naming the picture, if one cannot be used or shows too few of the lights."""
     T_approx = approximate_pose(pair, np.array(side.approx_position_m), np.array(side.approx_outboard))
-    spots = [_spots(path, pair) for path in _images(side)]
+    return fit_pictures(pair, side, T_approx)
+
+
+def fit_pictures(pair: StereoPair, side: SurveySide, T_approx: Array) -> PoseFit:
+    """Pose of one pair near ``T_approx`` from the survey's pictures. ProcessError names the picture."""
+    spots = (_spots(side.cam0_image, pair), _spots(side.cam1_image, pair))
     try:
-        return solve_pose(
-            pair,
-            T_approx,
-            [point.name for point in side.points],
-            np.array([point.xyz_m for point in side.points]).reshape(-1, 3),
-            np.array([point.sigma_mm / 1000.0 for point in side.points]),
-            spots[0],
-            spots[1],
-        )
+        return fit_survey(pair, side, T_approx, spots)
     except ProcessError as error:
         raise ProcessError(f"{side.cam0_image}, {side.cam1_image.name}: {error}") from error
+
+
+def fit_survey(pair: StereoPair, side: SurveySide, T_approx: Array, spots: tuple[Detections, Detections]) -> PoseFit:
+    """Pose of one pair near ``T_approx`` from spots in both cameras. Raises what ``solve_pose`` raises."""
+    return solve_pose(
+        pair,
+        T_approx,
+        [point.name for point in side.points],
+        np.array([point.xyz_m for point in side.points]).reshape(-1, 3),
+        np.array([point.sigma_mm / 1000.0 for point in side.points]),
+        *spots,
+    )
 
 
 def build_rig(pairs: dict[str, StereoPair], survey: Survey, fits: dict[str, PoseFit], made: dict[str, Any]) -> Rig:
@@ -80,6 +92,7 @@ def build_rig(pairs: dict[str, StereoPair], survey: Survey, fits: dict[str, Pose
             1000.0 * survey.row_time_us,
             fits[name].covariance,
             fits[name].by_calibration,
+            references_of(getattr(survey, name)),
         )
         for name in ("left", "right")
     }
@@ -88,6 +101,13 @@ def build_rig(pairs: dict[str, StereoPair], survey: Survey, fits: dict[str, Pose
     light = Light(*(value / 1000.0 for value in millimetres))
     layout = MarkerLayout(markers.pairs_station_m, markers.chord_m, markers.height_m, light)
     return Rig(sides["left"], sides["right"], layout, made)
+
+
+def references_of(side: SurveySide) -> tuple[ReferenceLight, ...]:
+    """The surveyed lights that are seen in flight, too."""
+    return tuple(
+        ReferenceLight(point.name, point.xyz_m, point.sigma_mm / 1000.0) for point in side.points if point.on_fuselage
+    )
 
 
 def _images(side: SurveySide) -> tuple[Path, Path]:
@@ -125,11 +145,19 @@ def summarise(fit: PoseFit) -> dict[str, Any]:
         "chi2_ratio": fit.chi2_ratio,
         "sigma_rotation_deg": [float(value) for value in np.degrees(sigma[:3])],
         "sigma_position_mm": [float(1000.0 * value) for value in sigma[3:]],
+        "lens": None
+        if fit.lens is None
+        else {
+            "focal_change_percent": [100.0 * float(value) for value in fit.lens.focal_change],
+            "focal_sigma_percent": [100.0 * float(value) for value in fit.lens.focal_sigma],
+            "turn_deg": [float(value) for value in np.degrees(fit.lens.turn_rad)],
+            "turn_sigma_deg": [float(value) for value in np.degrees(fit.lens.turn_sigma_rad)],
+        },
         "warnings": fit.warnings,
     }
 
 
-def _print(side: str, summary: dict[str, Any]) -> None:
+def print_fit(side: str, summary: dict[str, Any]) -> None:
     say(f"{side:<6}   light        dx      dy      dz mm   cam0    cam1 px")
     for point in summary["points"]:
         if not point["used"]:
@@ -145,3 +173,14 @@ def _print(side: str, summary: dict[str, Any]) -> None:
     position = " ".join(f"{value:.2f}" for value in summary["sigma_position_mm"])
     rotation = " ".join(f"{value:.4f}" for value in summary["sigma_rotation_deg"])
     say(f"         sigma of the pose: {position} mm, {rotation} deg (x, y, z)")
+    lens = summary["lens"]
+    if lens is None:
+        say("         lenses not checked: too few lights")
+        return
+    focal = ", ".join(
+        f"cam{camera} {change:+.2f} +- {sigma:.2f} %"
+        for camera, (change, sigma) in enumerate(
+            zip(lens["focal_change_percent"], lens["focal_sigma_percent"], strict=True)
+        )
+    )
+    say(f"         as calibrated: focal lengths {focal}")

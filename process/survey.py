@@ -26,6 +26,8 @@ class SurveyPoint(_Strict):
     """body frame"""
     sigma_mm: float = Field(gt=0.0, le=100.0, allow_inf_nan=False)
     """of each coordinate"""
+    on_fuselage: bool = False
+    """it stays on the aircraft, and is seen in flight"""
 
 
 class SurveySide(_Strict):

@@ -16,7 +16,7 @@ from process.calibrate import CalibrationSettings, Method, calibrate, calibratio
 from process.calibration_session import image_pairs
 from process.camera_model import CameraModel, StereoPair, pose_matrix, read_pair
 from process.cli import app
-from process.rig import triangulate_midpoint
+from process.pose_fit import triangulate_midpoint
 
 BOARD = Board(10, 7, 0.03)
 SIZE = (2080, 1552)

@@ -11,7 +11,8 @@ from capture.errors import ProcessError, UsageError
 from process.camera_model import CameraModel, Rig, StereoPair, pose_matrix, write_pair
 from process.cli import app
 from process.detect import Detections
-from process.rig import approximate_pose, solve_pose, triangulate_midpoint
+from process.pose_fit import triangulate_midpoint
+from process.rig import approximate_pose, solve_pose
 from process.survey import read_survey
 
 CAMERA = CameraModel(
