@@ -1,6 +1,7 @@
 """A recording's provenance to which camera stood where, held against the rig: swapped cameras are not measured with."""
 
 import json
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -59,6 +60,6 @@ def _serials_of(path: Path) -> dict[str, str]:
                     return {str(place): str(serial) for place, serial in value.items()}
                 if isinstance(record, Chunk):
                     break
-    except (McapError, OSError, ValueError, AttributeError):
+    except (McapError, struct.error, ValueError, AttributeError, OverflowError, MemoryError, EOFError, OSError):
         pass  # what is wrong with a file, reading its frames will tell
     return {}

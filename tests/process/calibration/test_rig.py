@@ -288,3 +288,97 @@ def test_how_the_pose_moves_with_the_calibration():
         # the second derivatives of the residuals are left out (Gauss and Newton): they are small beside the first
         np.testing.assert_allclose(fit.by_calibration[:3, index], slope[:3], atol=0.05 * scale[0])
         np.testing.assert_allclose(fit.by_calibration[3:, index], slope[3:], atol=0.05 * scale[1])
+
+
+def solve_with(pair, points, seed, moved=None):
+    rng = np.random.default_rng(seed)
+    places = points + rng.normal(0.0, SURVEY_SIGMA_M, points.shape)
+    if moved is not None:
+        places[moved] += [0.0, 0.0, 0.02]
+    names, sigma = [f"P{number}" for number in range(len(points))], np.full(len(points), SURVEY_SIGMA_M)
+    return solve_pose(pair, T_NOMINAL, names, places, sigma, spots(points, 0, rng), spots(points, 1, rng))
+
+
+def calibrated_before(focal0, focal1, turn_rad=(0.0, 0.0, 0.0)):
+    """The pair as it was before its lenses grew longer by these parts and cam1 turned: what the file has."""
+    values = PAIR.parameters
+    values[:2] /= 1.0 + focal0
+    values[9:11] /= 1.0 + focal1
+    values[18:21] -= turn_rad
+    return PAIR.with_parameters(values)
+
+
+def test_untouched_lenses_are_known_to_be():
+    chi2 = []
+    for seed in range(12):
+        lens = solve_with(PAIR, lights(10, 40 + seed), seed, moved=3 if seed % 2 else None).lens
+        assert lens.findings() == []
+        assert lens.lights == (9 if seed % 2 else 10)  # a light with a wrong coordinate does not matter
+        assert lens.focal_sigma.max() < 1.5e-3
+        changes = np.concatenate([lens.focal_change, lens.turn_rad])
+        chi2.append((changes / np.concatenate([lens.focal_sigma, lens.turn_sigma_rad])) ** 2)
+    # five changes, twelve times: each about 1 ± 0.4, and correlated
+    assert 0.3 < np.mean(chi2) < 2.0
+
+
+@pytest.mark.parametrize(
+    ("focal0", "focal1", "turn", "says"),
+    [
+        (0.01, 0.0, 0.0, r"cam0's focal length is (1\.0\d|0\.9\d) \+- 0\.\d\d % longer than calibrated: a lens"),
+        (0.0, -0.005, 0.0, r"cam1's focal length is 0\.(4|5)\d \+- 0\.\d\d % shorter"),
+        (0.03, 0.03, 0.0, r"cam0's focal length is .* longer than calibrated and cam1's focal length is .* longer"),
+        (0.0, 0.0, 0.002, r"cam1 has turned against cam0 by 0\.11\d, "),
+        (0.08, 0.0, 0.0, r"0 of 10 surveyed lights can be used.*was a lens touched"),  # beyond what can be put together
+    ],
+)
+def test_a_touched_lens_is_refused_with_numbers(focal0, focal1, turn, says):
+    with pytest.raises(ProcessError, match=says):
+        solve_with(calibrated_before(focal0, focal1, (turn, 0.0, 0.0)), lights(10, 33), 4)
+
+
+def test_too_few_lights_leave_the_lenses_unchecked():
+    assert solve_with(PAIR, lights(4, 33), 4).lens is None
+
+
+def repose(folder, *more):
+    rig, survey, output = (str(folder / name) for name in ("rig.json", "survey.toml", "new.json"))
+    arguments = ["repose", rig, "--survey", survey, "-o", output, "--json", *map(str, more)]
+    return CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+def test_a_pose_is_renewed_in_the_field(survey_folder, tmp_path, recording_writer):
+    assert command(survey_folder).exit_code == 0
+    survey = survey_folder / "survey.toml"
+    survey.write_text(survey.read_text().replace("sigma_mm = 0.3", "sigma_mm = 0.3\non_fuselage = true"))
+    before = Rig.read(survey_folder / "rig.json")
+    knocked = pose_matrix([0.002, 0.0, -0.001], [0.001, 0.0, 0.002])
+    points = lights(8, 13)
+    writer = recording_writer(tmp_path / "flight" / "burst.mcap")
+    for camera in (0, 1):
+        # the same lights seen by a pair that was knocked: it sees them where the old one would, were they moved back
+        image = draw(in_pixels(points @ knocked[:3, :3] - knocked[:3, 3] @ knocked[:3, :3], camera))
+        for side in ("left", "right"):
+            cv2.imwrite(str(survey_folder / f"{side}{camera}.png"), image)
+            writer.frame(side, f"cam{camera}", 0, image, 1_700_000_000_000_000_000)
+    writer.close()
+    for more in ((), ("--flight", tmp_path / "flight")):
+        done = repose(survey_folder, *more)
+        assert done.exit_code == 0
+        after = Rig.read(survey_folder / "new.json")
+        np.testing.assert_allclose(after.right.T_body_cam0, knocked @ before.right.T_body_cam0, atol=3e-4)
+        np.testing.assert_array_equal(after.right.pair.T_cam1_cam0, before.right.pair.T_cam1_cam0)
+        assert after.markers == before.markers
+        assert [light.name for light in after.left.references] == [f"left{number}" for number in range(8)]
+        moved = json.loads(done.stdout)["right"]["moved"]
+        assert moved["turn_deg"] == pytest.approx(np.degrees(np.hypot(0.002, 0.001)), abs=0.01)
+        assert moved["shift_mm"] > 1.0
+        assert moved["tip_mm"] > 0.5
+
+
+def test_other_cameras_than_the_rigs_are_not_reposed(survey_folder):
+    assert command(survey_folder).exit_code == 0
+    survey = survey_folder / "survey.toml"
+    survey.write_text(survey.read_text().replace('"left-0"', '"left-9"'))
+    with pytest.raises(ProcessError, match=r"left cameras are left-9 and left-1, those of .* left-0 and left-1"):
+        repose(survey_folder)
+    assert not (survey_folder / "new.json").exists()
