@@ -173,8 +173,9 @@ class Config(_Table):
 
     @property
     def ring_slots(self) -> int:
-        """Slots of each camera's ring: the stall it must bridge, and what the driver always holds."""
-        return math.ceil(self.ring.stall_s * self.trigger.rate_hz) + DRIVER_BUFFERS
+        """Slots of each camera's ring: the stall it must bridge (at least what a silent camera may claim of its
+        partner's room, see capture.grabber.SideGate), and what the driver always holds."""
+        return max(math.ceil(self.ring.stall_s * self.trigger.rate_hz), DRIVER_BUFFERS + 1) + DRIVER_BUFFERS
 
 
 DRIVER_BUFFERS = 10

@@ -5,7 +5,7 @@ import datetime
 import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from capture.disk import Disk
 from capture.errors import CameraError, DiskError, TriggerBoardError
 from capture.flight import metadata_yaml
 from capture.gates import Gates, judge_cameras, judge_clock
-from capture.grabber import Grabber
+from capture.grabber import STOP_DEADLINE_S, Absence, Grabber
 from capture.health_writer import HealthWriter
 from capture.lane import Lane, LaneParts, check_ring_memory, make_lane
 from capture.ledger import CameraAccount, Ledger, Place
@@ -64,6 +64,7 @@ class RecordingResult:
     discarded: dict[Place, int]  # frames that were nobody's: duplicates, and some that no trigger asked for
     garbled_lines: int  # of the board
     aux_dropped: int  # small messages that one of the disks did not take
+    absences: dict[Place, list[Absence]] = field(default_factory=dict)  # of cameras that were gone for a time
     failures: list[str] = field(default_factory=list)
 
     @property
@@ -96,6 +97,7 @@ class RecordingResult:
             "board_lines_garbled": self.garbled_lines,
             "aux_messages_dropped": self.aux_dropped,
             "seconds": self.seconds,
+            "absences": {"/".join(place): [asdict(a) for a in found] for place, found in self.absences.items()},
             "failures": self.failures,
         }
 
@@ -248,6 +250,7 @@ class Recording:
             calibration=self._calibration(),
             clock_state=self._ptp.now if self._ptp else lambda: FREE_RUNNING,
             trigger_latency_ns=round(self._config.camera.trigger_latency_us * 1e3),
+            judge=self._gates.judge,
         )
         camera = self._config.camera
         check_ring_memory(len(self._cameras), self._config.ring_slots, camera.width, camera.height)
@@ -353,13 +356,14 @@ class Recording:
     ) -> RecordingResult:
         first_index = self._config.trigger.first_index
         next_index = count.next_index if count else self._ledger.next_index
+        self._ledger.triggered(next_index)
         deadline_s = self._clock.monotonic_s() + DRAIN_DEADLINE_S
         while self._clock.monotonic_s() < deadline_s and not all(
-            self._ledger.complete(place, next_index) or not grabber.running for place, grabber in self._grabbers.items()
+            self._ledger.complete(place, next_index) or not grabber.present for place, grabber in self._grabbers.items()
         ):
             self._clock.sleep(0.005)
         for place, grabber in self._grabbers.items():
-            if not grabber.stop(deadline_s=DRAIN_DEADLINE_S):
+            if not grabber.stop(deadline_s=STOP_DEADLINE_S):
                 self._failures.append(f"{'/'.join(place)}: its read thread hangs in the camera driver")
             if grabber.error is not None:
                 self._failures.append(str(grabber.error))
@@ -420,6 +424,7 @@ class Recording:
             discarded={place: grabber.discarded for place, grabber in self._grabbers.items()},
             garbled_lines=garbled_lines,
             aux_dropped=sum(recorder.aux_dropped for recorder in self._recorders.values()),
+            absences={place: grabber.absences for place, grabber in self._grabbers.items() if grabber.absences},
             failures=self._failures,
         )
 

@@ -1,39 +1,29 @@
 """A side's lane: its cameras, their rings and read threads, and the write thread of its disk, wired together."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from capture.camera.base import Camera, CameraDescription
-from capture.clock import Clock
 from capture.config import DiskConfig
 from capture.disk import Disk
-from capture.frame_clock import FrameClock
-from capture.grabber import Grabber, SideGate
-from capture.ledger import Ledger
-from capture.numbering import Triggers
-from capture.ptp import FREE_RUNNING, ClockState
+from capture.grabber import Grabber, ReadParts, SideGate
 from capture.record import frame_topic, image_topic
 from capture.recorder import Recorder, camera_channels
 from capture.ring import Ring, check_memory
 from capture.segment import FrameLayout
 
 
-@dataclass(frozen=True)
-class LaneParts:
+@dataclass(frozen=True, kw_only=True)
+class LaneParts(ReadParts):
     """What all lanes of a recording share."""
 
     disk: Disk
     disk_config: DiskConfig
     provenance: dict[str, str]
-    ledger: Ledger
-    triggers: Triggers
-    clock: Clock
     ring_slots: int
     lock_memory: bool
     calibration: tuple[str, bytes] | None = None  # name and content
-    clock_state: Callable[[], ClockState] = lambda: FREE_RUNNING  # of this computer, asked for each frame
-    trigger_latency_ns: int = 0  # from a trigger to the start of row 0's exposure
 
 
 @dataclass(frozen=True)
@@ -101,18 +91,7 @@ def make_lane(
     rings = {name: Ring(parts.ring_slots, layouts[name].slot_bytes, parts.lock_memory) for name in names}
     gate = SideGate(list(rings.values()))
     grabbers = {
-        name: Grabber(
-            (side, name),
-            camera,
-            description,
-            rings[name],
-            layouts[name],
-            gate,
-            parts.triggers,
-            parts.ledger,
-            recorder,
-            FrameClock(description, parts.triggers, parts.clock_state, parts.trigger_latency_ns),
-        )
+        name: Grabber((side, name), camera, description, rings[name], layouts[name], gate, recorder, parts)
         for name, (camera, description) in cameras.items()
     }
     return Lane(side, recorder, grabbers)

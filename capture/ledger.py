@@ -12,6 +12,7 @@ from capture.record import Loss, LossStage
 
 Place = tuple[str, str]
 """A camera's side and name."""
+NOT_EXPOSED = "the camera did not expose on this trigger"
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,14 @@ class Ledger:
         with self._mutex:
             self._next_index = max(self._next_index, next_index)
 
-    def arrived(self, place: Place, index: int, lost_in_delivery: int = 0) -> bool:
+    def arrived(self, place: Place, index: int, lost_in_delivery: int = 0, why_not_exposed: str = NOT_EXPOSED) -> bool:
         """A frame of ``index`` came from the driver. Every index it skipped is lost.
 
         Args:
             place: the camera.
             index: the frame's trigger index.
             lost_in_delivery: how many of the skipped ones the camera exposed (its frame counter went on).
+            why_not_exposed: cause of the loss of the others.
 
         Returns:
             False when this index was decided upon before: the frame is a duplicate and must be dropped.
@@ -81,7 +83,7 @@ class Ledger:
         exposed_from = index - lost_in_delivery
         for missing in skipped:
             if missing < exposed_from:
-                self._book(place, missing, LossStage.CAMERA, "the camera did not expose on this trigger")
+                self._book(place, missing, LossStage.CAMERA, why_not_exposed)
             else:
                 self._book(place, missing, LossStage.USB, "exposed by the camera, never delivered")
         return True
@@ -99,15 +101,20 @@ class Ledger:
             self._accounts[place].pending.remove(index)
         self._book(place, index, stage, cause)
 
+    def absent(self, place: Place, cause: str) -> None:
+        """The camera is gone, or will show no more: what it has not shown of the triggers given so far is lost."""
+        account = self._accounts[place]
+        with self._mutex:
+            missing = range(account.next_index, self._next_index)
+            account.next_index = max(account.next_index, self._next_index)
+        for index in missing:
+            self._book(place, index, LossStage.CAMERA, cause)
+
     def close(self, next_index: int, cause: str = "no frame came before the recording ended") -> None:
         """No trigger at or above ``next_index`` was given; what never came is lost."""
         self.triggered(next_index)
-        for place, account in self._accounts.items():
-            with self._mutex:
-                missing = range(account.next_index, next_index)
-                account.next_index = max(account.next_index, next_index)
-            for index in missing:
-                self._book(place, index, LossStage.CAMERA, cause)
+        for place in self._accounts:
+            self.absent(place, cause)
 
     def settle(self, cause: str) -> None:
         """What arrived and is neither recorded nor lost by now never will be. After the write threads have ended."""

@@ -173,6 +173,7 @@ class Vitals:
             ring_slots=grabber.ring.slots,
             ring_high_water=grabber.ring.high_water,
             exposure_us=self._config.camera.exposure_us,
+            temperature_c=grabber.temperature_c,
         )
         level, message = self._judge_camera(health, grabber, sample, sample.triggers - triggers_then)
         values = {
@@ -193,6 +194,8 @@ class Vitals:
             return OK, self.state
         if not grabber.running:
             return ERROR, str(grabber.error or "its read thread has ended")
+        if grabber.is_absent:
+            return ERROR, f"{grabber.absences[-1].cause}; looked for: {grabber.seek_error or 'not yet'}"
         if unanswered > max(3.0, SILENT_S * rate_hz):
             return ERROR, f"no frame on the last {unanswered} triggers: check its cable and its power"
         place = grabber.place

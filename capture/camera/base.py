@@ -83,7 +83,10 @@ class Camera(ABC):
 
     @abstractmethod
     def queue(self, slot: int, buffer: memoryview) -> None:
-        """Give the driver an empty buffer of at least width × height bytes, to be filled in place."""
+        """Give the driver an empty buffer of at least width × height bytes, to be filled in place.
+
+        Never raises on a camera that is gone: ``grab`` tells.
+        """
 
     @abstractmethod
     def arm(self) -> None:

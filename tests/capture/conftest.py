@@ -18,7 +18,7 @@ import pytest
 
 import capture.camera
 from capture.camera.base import Camera, CameraDescription, CameraSettings, FrameStatus, Grab
-from capture.errors import CameraLost
+from capture.errors import CameraError, CameraLost
 from capture.trigger_protocol import Pulse, decode_line, encode_line
 
 WIDTH, HEIGHT = 64, 48
@@ -41,6 +41,7 @@ class FakeRig:
     incomplete: set[tuple[str, int]] = field(default_factory=set)
     repeated: set[tuple[str, int]] = field(default_factory=set)  # delivered twice
     unplugged_at: dict[str, int] = field(default_factory=dict)
+    replugged_at: dict[str, int] = field(default_factory=dict)
     silent_pulses: set[int] = field(default_factory=set)  # the board does not report them
     garbled_pulses: set[int] = field(default_factory=set)
     cameras: dict[str, "FakeCamera"] = field(default_factory=dict)
@@ -63,8 +64,12 @@ class FakeCamera(Camera):
         self._done: queue.SimpleQueue = queue.SimpleQueue()
         self._frame_id = 65530 + len(address)  # soon wraps
         self._armed = False
+        self._gone = False
+        self._zero_ns = -5_000_000_000  # of its clock
 
     def open(self) -> CameraDescription:
+        if self._gone:
+            raise CameraError("no such camera: plug it in")
         self.rig.cameras[self.address] = self
         return CameraDescription(
             "fake", f"serial-{self.address}", WIDTH, HEIGHT, self.settings.exposure_us, 0.0, ROW_TIME_NS, 1e9, 16, True
@@ -78,10 +83,13 @@ class FakeCamera(Camera):
 
     def edge(self, index: int, now_ns: int) -> None:
         key = (self.address, index)
-        if not self._armed or key in self.rig.missed:
-            return
-        if self.rig.unplugged_at.get(self.address, 1 << 60) <= index:
+        if self.rig.unplugged_at.get(self.address) == index:
+            self._gone, self._armed = True, False
             self._done.put(CameraLost("unplugged: check its cable"))
+        if self.rig.replugged_at.get(self.address) == index:
+            self._gone, self._frame_id, self._zero_ns = False, 0, now_ns
+            self._buffers, self._done = queue.SimpleQueue(), queue.SimpleQueue()
+        if not self._armed or key in self.rig.missed:
             return
         self._frame_id = (self._frame_id + 1) % 65536
         if key in self.rig.undelivered:
@@ -91,9 +99,8 @@ class FakeCamera(Camera):
             buffer[:] = memoryview(pixels_of(self.address, index))
             ready_ns = now_ns + self.settings.exposure_us * 1000 + ROW_TIME_NS * HEIGHT
             status = FrameStatus.INCOMPLETE if key in self.rig.incomplete else FrameStatus.COMPLETE
-            self._done.put(
-                Grab(slot, self._frame_id, now_ns + 5_000_000_000, ready_ns, self.settings.exposure_us, 0.0, status)
-            )
+            ticks = now_ns - self._zero_ns
+            self._done.put(Grab(slot, self._frame_id, ticks, ready_ns, self.settings.exposure_us, 0.0, status))
 
     def grab(self, timeout_s: float) -> Grab | None:
         with contextlib.suppress(queue.Empty):

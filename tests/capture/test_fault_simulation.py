@@ -6,7 +6,6 @@ A failing seed replays with ``Simulation(Plan.of(seed)).run(folder)``.
 import dataclasses
 import os
 import tempfile
-import types
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -80,7 +79,7 @@ def off_by_one_index(patch):
 
 
 def missed_crc(patch):
-    patch.setattr("capture.segment.zlib", types.SimpleNamespace(crc32=lambda data: 12345))
+    patch.setattr("capture.segment.crc32", lambda data: 12345)
 
 
 def slot_given_back_early(patch):
@@ -154,10 +153,31 @@ def failed_disk_ignored(patch):
     patch.setattr(Recorder, "_fail", lambda self, error: None)
 
 
+def room_promised_for_ever(patch):
+    def decide(self, index):
+        self._decisions[index] = all(ring.free > len(self._promised[id(ring)]) for ring in self._rings)
+        for promised in self._promised.values() if self._decisions[index] else ():
+            promised.add(index)
+
+    patch.setattr(SideGate, "_decide", decide)
+
+
+def numbering_kept_over_an_absence(patch):
+    seek = Grabber.seek
+
+    def keep(self):
+        numbering = self._numbering
+        is_back = seek(self)
+        self._numbering = numbering
+        return is_back
+
+    patch.setattr(Grabber, "seek", keep)
+
+
 BUGS = (
     swapped_slots, off_by_one_index, missed_crc, slot_given_back_early, loss_not_recorded, frame_dropped_silently,
     duplicate_recorded, incomplete_taken_for_complete, short_write_ignored, pixels_shifted, end_of_flight_forgotten,
-    failed_disk_ignored, sets_torn,
+    failed_disk_ignored, sets_torn, room_promised_for_ever, numbering_kept_over_an_absence,
 )  # fmt: skip
 
 

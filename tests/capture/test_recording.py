@@ -42,6 +42,13 @@ def frames_of(folder: Path) -> dict[tuple[str, int], bytes]:
     return frames
 
 
+def messages_of(path: Path, topic: str) -> list:
+    """Decoded messages of a small topic."""
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [message for _, _, _, message in reader.iter_decoded_messages(topics=[topic])]
+
+
 def test_every_frame_shown_is_recorded_with_its_own_content(write_config, rig, tmp_path, pixels_of):
     result = record(write_config())
     assert (result.triggers, result.recorded, result.lost, result.failures) == (TRIGGERS, 4 * TRIGGERS, 0, [])
@@ -93,7 +100,46 @@ def test_an_unplugged_camera_leaves_the_others_without_a_gap(write_config, rig, 
     accounts = {"/".join(place): (account.recorded, account.lost_total) for place, account in result.accounts.items()}
     assert accounts.pop("right/cam1") == (10, TRIGGERS - 10)
     assert set(accounts.values()) == {(TRIGGERS, 0)}
-    assert "right/cam1" in result.failures[0]
+    assert "right/cam1: unplugged: check its cable; its last frame was of trigger 9" in result.failures[0]
+    report = inspect([tmp_path])
+    assert report.problems == []
+    assert set(report.cameras["right/cam1"].lost_indices) == set(range(10, TRIGGERS))
+
+
+def test_a_camera_that_comes_back_is_tied_to_its_triggers_again(write_config, rig, tmp_path, pixels_of):
+    rig.unplugged_at, rig.replugged_at = {"right_cam1": 10}, {"right_cam1": 70}
+    result = record(write_config(), triggers=200)
+    accounts = {"/".join(place): account for place, account in result.accounts.items()}
+    back = accounts.pop("right/cam1")
+    assert back.lost.keys() == {"camera"}
+    assert 60 <= back.lost_total <= 150  # looked for every half second, which is 50 triggers
+    assert {(account.recorded, account.lost_total) for account in accounts.values()} == {(200, 0)}
+    assert result.failures == []
+    (absence,) = result.absences["right", "cam1"]
+    assert absence.end_ns - absence.begin_ns > 0.55e9
+    report = inspect([tmp_path])
+    assert report.problems == []
+    lost = set(report.cameras["right/cam1"].lost_indices)
+    assert lost == set(range(10, 10 + len(lost)))
+    for (camera, index), pixels in frames_of(tmp_path / "ssd_right/test").items():
+        assert pixels == pixels_of(camera, index).tobytes()
+    marks = messages_of(tmp_path / "ssd_left/test/aux_0000.mcap", "/gate")
+    assert [(mark.name, mark.begin_ns, mark.end_ns) for mark in marks] == [
+        ("camera right/cam1", absence.begin_ns, 0),
+        ("camera right/cam1", absence.begin_ns, absence.end_ns),
+    ]
+    losses = messages_of(tmp_path / "ssd_left/test/aux_0000.mcap", "/loss")
+    assert all("its last frame was of trigger 9" in loss.cause for loss in losses)
+
+
+@pytest.mark.parametrize("silent", ["left_cam0", "left_cam1"])
+def test_a_silent_camera_does_not_take_its_partner_s_room(write_config, rig, tmp_path, silent):
+    """Its trigger cable is broken, say: it is there, and gives nothing."""
+    rig.missed = {(silent, index) for index in range(5, 300)}
+    result = record(write_config(), triggers=300)
+    lost = {"/".join(place): account.lost for place, account in result.accounts.items()}
+    assert lost.pop(silent.replace("_", "/")) == {"camera": 295}
+    assert set(map(str, lost.values())) == {"{}"}
     assert inspect([tmp_path]).problems == []
 
 

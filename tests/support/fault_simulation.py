@@ -1,8 +1,8 @@
 """The recorder on simulated time, cameras and disks: a seed decides what goes wrong and replays it.
 
 Fault model
-    cameras     do not expose on a trigger; expose and never deliver; deliver in part, twice or late; are unplugged; are
-                armed late; their frame counter wraps
+    cameras     do not expose on a trigger; expose and never deliver; deliver in part, twice or late; are unplugged, and
+                plugged in again with another frame counter and clock; are armed late; their counter wraps
     board       its report of a pulse is lost
     disks       stall (longer than the ring bridges, or shorter); take a write in part; are full; answer with EIO; fail
                 to sync
@@ -26,7 +26,7 @@ from pathlib import Path
 from capture.camera.base import Camera, CameraDescription, CameraSettings, FrameStatus, Grab
 from capture.config import DRIVER_BUFFERS, DiskConfig
 from capture.daemon import AuxLog
-from capture.errors import CameraLost
+from capture.errors import CameraError, CameraLost
 from capture.lane import Lane, LaneParts, make_lane
 from capture.ledger import Ledger, Place
 from capture.record import CAMERAS, SIDES, Trigger, decode_image
@@ -40,13 +40,14 @@ WIDTH, HEIGHT = 16, 8
 PERIOD_NS = 40_000_000
 EXPOSURE_US, ROW_TIME_NS = 2000, 10_000
 START_NS = 1_800_000_000_000_000_000
-RING_SLOTS = DRIVER_BUFFERS + 8
+RING_SLOTS = 2 * DRIVER_BUFFERS + 2
 NOTHING = 1 << 60
+SEEK_NS = 55_000_000
 
 
 FAULTS = (
-    "missed", "undelivered", "incomplete", "repeated", "late", "unplugged", "armed late", "unreported", "stall",
-    "long stall", "short write", "full", "EIO", "sync fails", "writer dies", "kill", "power cut",
+    "missed", "undelivered", "incomplete", "repeated", "late", "unplugged", "replugged", "armed late", "unreported",
+    "stall", "long stall", "short write", "full", "EIO", "sync fails", "writer dies", "kill", "power cut",
 )  # fmt: skip
 
 
@@ -72,6 +73,7 @@ class Plan:
     repeated: set[tuple[Place, int]] = field(default_factory=set)
     late_ns: dict[tuple[Place, int], int] = field(default_factory=dict)
     unplugged_at: dict[Place, int] = field(default_factory=dict)
+    replugged_at: dict[Place, int] = field(default_factory=dict)
     armed_at: dict[Place, int] = field(default_factory=dict)
     unreported: set[int] = field(default_factory=set)
     disk_faults: dict[str, dict[int, str]] = field(default_factory=dict)  # side: write number: fault
@@ -98,8 +100,11 @@ class Plan:
                 faults.update(draw.sample(events, draw.randint(1, 4)))
         if draw.random() < 0.3:
             plan.late_ns = {event: draw.randint(1, 60_000_000) for event in draw.sample(events, 3)}
-        if draw.random() < 0.15:
-            plan.unplugged_at[draw.choice(places)] = draw.randrange(plan.triggers)
+        if draw.random() < 0.3:
+            place, index = draw.choice(places), draw.randrange(plan.triggers)
+            plan.unplugged_at[place] = index
+            if draw.random() < 0.7:
+                plan.replugged_at[place] = index + draw.randint(1, 20)
         if draw.random() < 0.15:
             plan.armed_at[draw.choice(places)] = draw.randint(1, 5)
         if draw.random() < 0.3:
@@ -152,16 +157,22 @@ class SimulatedCamera(Camera):
         draw = random.Random(seed * 31 + sum("/".join(place).encode()))
         self.frame_id = 65530 + draw.randrange(6)
         self.drift = 1 + draw.uniform(-50e-6, 50e-6)
+        self.zero_ns = START_NS - 10**12  # of its clock
+        self.plugged = True
+        self.armed = False
         self.buffers: deque[tuple[int, memoryview]] = deque()
         self.due: deque[Grab | CameraLost] = deque()
 
     def open(self) -> CameraDescription:
+        if not self.plugged:
+            raise CameraError("no such camera")
         return CameraDescription("sim", "0", WIDTH, HEIGHT, EXPOSURE_US, 0.0, ROW_TIME_NS, 1e9, 16, True)
 
     def queue(self, slot: int, buffer: memoryview) -> None:
         self.buffers.append((slot, buffer))
 
-    def arm(self) -> None: ...
+    def arm(self) -> None:
+        self.armed = True
 
     def grab(self, timeout_s: float) -> Grab | None:
         if not self.due:
@@ -171,9 +182,21 @@ class SimulatedCamera(Camera):
             raise found
         return found
 
-    def disarm(self) -> None: ...
+    def disarm(self) -> None:
+        self.armed = False
+        self.buffers.clear()
 
     def close(self) -> None: ...
+
+    def unplug(self) -> None:
+        """Nothing more comes out of it; what the driver already had does."""
+        self.plugged = self.armed = False
+        self.due.append(CameraLost("unplugged"))
+
+    def plug(self, now_ns: int) -> None:
+        """It has forgotten its counter and its time."""
+        self.plugged = True
+        self.frame_id, self.zero_ns = 0, now_ns
 
     def deliver(self, index: int, edge_ns: int, ready_ns: int, status: FrameStatus) -> bool:
         """Fill the oldest buffer; False when the driver has none."""
@@ -181,7 +204,7 @@ class SimulatedCamera(Camera):
             return False
         slot, buffer = self.buffers.popleft()
         buffer[:] = content(self.place, index)
-        ticks = round((edge_ns - START_NS) * self.drift) + 10**12
+        ticks = round((edge_ns - self.zero_ns) * self.drift)
         self.due.append(Grab(slot, self.frame_id, ticks, ready_ns, EXPOSURE_US, 0.0, status))
         return True
 
@@ -299,7 +322,7 @@ class Simulation:
         self.busy_until = dict.fromkeys(SIDES, 0)
         self.items = dict.fromkeys(SIDES, 0)
         self.dead_writers: set[str] = set()
-        self.lost_cameras: set[Place] = set()
+        self.given: set[tuple[Place, int]] = set()  # delivered whole by the driver
         self.dropped_by_driver = 0
         self.disks = {
             side: SimulatedDisk(dict(plan.disk_faults.get(side, {})), self._count_write, self.fired) for side in SIDES
@@ -379,16 +402,20 @@ class Simulation:
             self.aux.trigger(Trigger(index, pulse.counter, edge_ns, edge_ns, edge_ns))
         for place, camera in self.cameras.items():
             event = (place, index)
-            if place in self.lost_cameras:
+            if not camera.plugged:
+                continue
+            if index == self.plan.unplugged_at.get(place):
+                camera.unplug()
+                self.fired["unplugged"] += 1
+                self._read(place)
+                self._at(edge_ns + SEEK_NS, lambda p=place: self._seek(p))
+                back_ns = edge_ns + (self.plan.replugged_at.get(place, NOTHING) - index) * PERIOD_NS + PERIOD_NS // 3
+                self._at(back_ns, lambda c=camera: c.plug(self.clock.now_ns))
+                continue
+            if not camera.armed:
                 continue
             if event in self.plan.missed or index < self.plan.armed_at.get(place, 0):
                 self.fired["missed" if event in self.plan.missed else "armed late"] += 1
-                continue
-            if index >= self.plan.unplugged_at.get(place, NOTHING):
-                camera.due.append(CameraLost("unplugged"))
-                self.lost_cameras.add(place)
-                self.fired["unplugged"] += 1
-                self._at(edge_ns, lambda p=place: self._read(p))
                 continue
             self.fired["late"] += event in self.plan.late_ns
             ready_ns = edge_ns + EXPOSURE_US * 1000 + ROW_TIME_NS * HEIGHT + 1_000_000 + self.plan.late_ns.get(event, 0)
@@ -396,6 +423,8 @@ class Simulation:
 
     def _deliver(self, place: Place, index: int, edge_ns: int) -> None:
         camera, event = self.cameras[place], (place, index)
+        if not camera.armed or edge_ns < camera.zero_ns:  # exposed, but unplugged before it was read out
+            return
         camera.frame_id = (camera.frame_id + 1) % 65536
         for kind in ("undelivered", "incomplete", "repeated"):
             self.fired[kind] += event in getattr(self.plan, kind)
@@ -405,6 +434,8 @@ class Simulation:
         for _ in range(1 + (event in self.plan.repeated)):
             if not camera.deliver(index, edge_ns, self.clock.now_ns, status):
                 self.dropped_by_driver += 1
+            elif status is FrameStatus.COMPLETE:
+                self.given.add(event)
             self._read(place)
 
     def _read(self, place: Place) -> None:
@@ -412,8 +443,14 @@ class Simulation:
         try:
             while grabber.step(0.0):
                 pass
-        except CameraLost:
-            pass
+        except CameraLost as error:
+            grabber.lose(error)
+
+    def _seek(self, place: Place) -> None:
+        if self.lanes[place[0]].grabbers[place[1]].seek():
+            self.fired["replugged"] += 1
+        else:
+            self._at(self.clock.now_ns + SEEK_NS, lambda: self._seek(place))
 
     def _write(self, side: str) -> None:
         if side in self.dead_writers:
@@ -472,10 +509,15 @@ class Simulation:
             if camera.recorded < account.recorded or (not self.broken_disks and camera.recorded != account.recorded):
                 found.append(f"{place}: {account.recorded} recorded by the books, {camera.recorded} in the files")
             for index in range(self.plan.triggers):
-                if index in camera.indices and self._cannot_be_recorded(place, index):
+                if index in camera.indices and (place, index) not in self.given:
                     found.append(f"{place} trigger {index} is recorded, but the camera never gave it")
+                before = self.lost_at.get((place, index)) in ("camera", "usb")
+                if before and (place, index) in self.given and (place, index) not in self.plan.late_ns:
+                    found.append(f"{place} trigger {index} was given, but is booked as lost before")
         if self.plan.takeover and self.lost["disk"] and not all(disk.broken for disk in self.disks.values()):
             found.append(f"{self.lost['disk']} frames lost at the disk although the other one could take over")
+        if self.lost["ring"] and not any(self.fired[kind] for kind in ("stall", "long stall", "writer dies")):
+            found.append(f"{self.lost['ring']} frames lost at the ring although no disk stalled")
         for (place, index), stage in self.lost_at.items():
             partner = (place[0], CAMERAS[1 - CAMERAS.index(place[1])])
             if stage == "ring" and index in report.cameras["/".join(partner)].indices:
@@ -503,12 +545,6 @@ class Simulation:
         found += self._wrong_contents(folder.parent / "copy")
         del result
         return inspect([folder.parent / "copy"])
-
-    def _cannot_be_recorded(self, place: Place, index: int) -> bool:
-        event = (place, index)
-        plan = self.plan
-        gone = index >= plan.unplugged_at.get(place, NOTHING) or index < plan.armed_at.get(place, 0)
-        return gone or any(event in faults for faults in (plan.missed, plan.undelivered, plan.incomplete))
 
     def _wrong_contents(self, folder: Path) -> list[str]:
         """Every image in every file against what its camera showed on its trigger."""

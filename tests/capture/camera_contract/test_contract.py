@@ -184,8 +184,11 @@ def test_a_pulled_plug_is_told_and_the_camera_comes_back(bench):
     bench.harness.unplug()
     with pytest.raises(CameraLost, match=r"check|running"):
         bench.grab_until_lost()
+    bench.camera.queue(0, bench.pixels(0))
     bench.camera.disarm()
     bench.camera.close()
+    with pytest.raises(CameraError):
+        bench.camera.open()
     bench.harness.plug()
     assert bench.start().serial == camera.serial
     for _ in range(3):
