@@ -50,8 +50,9 @@ class Fit:
     position_m: Array  # (N + 1, 3) nodes, body frame
     R_body_section: Array  # (N + 1, 3, 3)
     twist_rad: Array  # (N + 1,) nose-up, against the unloaded wing
-    sigma_position_m: Array  # (N + 1, 3) one sigma
-    sigma_twist_rad: Array  # (N + 1,) one sigma
+    sigma_position_m: Array  # (N + 1, 3) one sigma of what is new in every instant: noise and prior
+    sigma_twist_rad: Array  # (N + 1,) the same
+    by_marker: Array  # (N + 1, 4, M, 3) how nodes (m) and twist (rad) follow, when a marker is measured elsewhere
     residual_m: Array  # (M, 3) measured minus model; NaN where not measured
     distance: Array  # (M,) the residual in sigmas; NaN where not measured
     outlier: Mask  # (M,) bool: measured, but too far off to be believed; not used
@@ -307,9 +308,10 @@ def _result(problem: Problem, state: State, stations: Array, scale: Array) -> Fi
     misfit = chi2 / dof
     # more misfit than chance explains widens the bands (Birge's ratio)
     factor = state.factor * np.sqrt(misfit if misfit > 1 + _SURELY * np.sqrt(2 / dof) else 1.0)
-    spin, slide = state.linear.spin @ factor.T, state.linear.slide @ factor.T
-    moves = slide + hat(shape.position_m).transpose(0, 2, 1) @ spin
-    twists = (twist_gradient(half, shape.R_body_section)[:, None, :] @ spin)[:, 0, :]
+    moves = state.linear.slide + hat(shape.position_m).transpose(0, 2, 1) @ state.linear.spin
+    twists = twist_gradient(half, shape.R_body_section)[:, None, :] @ state.linear.spin
+    by_unknown = np.concatenate([moves, twists], axis=1)
+    sigma = np.sqrt(np.sum((by_unknown @ factor.T) ** 2, axis=2))
     loads, load_covariance = _station_loads(problem, state, factor)
     k = len(problem.load_sigma)
     at_stations = problem.modes is None
@@ -330,8 +332,9 @@ def _result(problem: Problem, state: State, stations: Array, scale: Array) -> Fi
         position_m=shape.position_m,
         R_body_section=shape.R_body_section,
         twist_rad=twist_rad(half, shape.R_body_section),
-        sigma_position_m=np.sqrt(np.sum(moves**2, axis=2)),
-        sigma_twist_rad=np.sqrt(np.sum(twists**2, axis=1)),
+        sigma_position_m=sigma[:, :3],
+        sigma_twist_rad=sigma[:, 3],
+        by_marker=_by_marker(problem, state, by_unknown),
         residual_m=np.full((len(problem.seen), 3), np.nan),
         distance=np.where(problem.seen, state.linear.distance, np.nan),
         outlier=problem.seen & ~used,
@@ -339,6 +342,16 @@ def _result(problem: Problem, state: State, stations: Array, scale: Array) -> Fi
         chi2=chi2,
         dof=dof,
     )
+
+
+def _by_marker(problem: Problem, state: State, by_unknown: Array) -> Array:
+    """(N + 1, 4, M, 3) of nodes and twist by the markers' measured places (eq. 21a)."""
+    believed = state.weight[:, None, None]
+    A = np.sqrt(believed) * state.linear.jacobian
+    pull = (A.transpose(0, 2, 1) @ (np.sqrt(believed) * state.linear.by_point)).transpose(1, 0, 2)
+    normal = A.reshape(-1, A.shape[2]).T @ A.reshape(-1, A.shape[2]) + np.diag(problem.prior)
+    follows = np.linalg.solve(normal, pull.reshape(len(pull), -1))
+    return (by_unknown @ follows).reshape(*by_unknown.shape[:2], *pull.shape[1:])
 
 
 def _station_loads(problem: Problem, state: State, factor: Array) -> tuple[Array, Array]:
@@ -391,6 +404,7 @@ def _failed(half: HalfWing, stations: Array, iterations: int, reason: str) -> Fi
         twist_rad=nan(n + 1),
         sigma_position_m=nan(n + 1, 3),
         sigma_twist_rad=nan(n + 1),
+        by_marker=nan(n + 1, 4, markers, 3),
         residual_m=nan(markers, 3),
         distance=nan(markers),
         outlier=none,

@@ -62,6 +62,7 @@ class Linear:
     slide: Array  # and move them: a point p of node n moves by slide[n] + spin[n] × p
     distance: Array  # (M,) sigmas between measured and model
     jacobian: Array  # (M, d, u) of the markers, in sigmas
+    by_point: Array  # (M, d, 3) the same by where the markers are
     predicted: Array  # (M, d) residual after the correction, in sigmas
 
 
@@ -162,6 +163,7 @@ def linearise(problem: Problem, strain: Array, theta: Array) -> Linear:
         slide=slide[:, :, :-1],
         distance=np.sqrt(np.sum(residual**2, axis=1)),
         jacobian=motion[:, :, :-1],
+        by_point=by_point,
         predicted=residual + motion[:, :, -1],
     )
 

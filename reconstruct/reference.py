@@ -1,7 +1,7 @@
-"""Fits of a flight → the shape that displacements and twist are counted from: unloaded, or recorded at rest."""
+"""A recorded window, another result, or the unloaded wing → the shape that displacements and twist are counted from."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,75 +9,71 @@ import pyarrow as pa
 
 from capture.errors import UsageError
 from process.reference import Window
-from reconstruct.series import SideFits, fit_series
-from reconstruct.tables import SHAPE, Floats, marker_series, read_table, shape_series
-from reconstruct.wing import Wing
+from reconstruct.fit import Fit
+from reconstruct.rotation import Array
+from reconstruct.shared import SharedError, sigma_of
+from reconstruct.tables import shape_series
+from reconstruct.wing import HalfWing
+
+UNLOADED_WING = "unloaded wing"
+
 
 Reference = Window | Path | None
 """a window of this recording, markers at rest, another result (its folder, its shape table), or the unloaded wing"""
 
 
-def refer(fits: Mapping[str, SideFits], reference: Reference, wing: Wing) -> dict[str, SideFits]:
-    """The fits, with the shape their displacements are counted from, and its name.
+@dataclass(frozen=True, eq=False)
+class ReferenceShape:
+    """One side's shape that displacements are counted from, and how well it is known."""
 
-    Markers at rest (``wingproc reference``) are fitted with ``wing``, as the flight's were. Of a window or a result it
-    is the mean over the fitted sets. Its own noise, smaller by the root of their number, is not in any sigma. Raises
-    UsageError when it has no fitted set of a side, or other stations.
+    name: str
+    xyz_m: Array  # (N + 1, 3) body frame
+    twist_rad: Array  # (N + 1,) against the unloaded wing
+    sigma: Array  # (N + 1, 4) one sigma of nodes (m) and twist (rad) that displacements from it have from it
+    shared: Array | None  # (N + 1, 4, P) its answer to the errors that all frames share; None: it has not that of ours
+
+
+def unloaded(half: HalfWing) -> ReferenceShape:
+    """The wing file's wing without loads: exact by definition."""
+    nodes = len(half.rest_position_m)
+    return ReferenceShape(UNLOADED_WING, half.rest_position_m, np.zeros(nodes), np.zeros((nodes, 4)), None)
+
+
+def mean_of(
+    name: str, half: HalfWing, fits: Iterable[Fit], shared: SharedError | None, *, same: bool = True
+) -> ReferenceShape | None:
+    """The mean of the fits that converged, its noise smaller by the root of their number; None where there is none.
+
+    ``shared`` are the errors that its frames share; ``same`` says that they are the flight's own, and cancel.
     """
-    if reference is None:
-        return dict(fits)
-    if isinstance(reference, Window):
-        return _from_window(fits, reference)
-    path = reference / SHAPE if reference.is_dir() else reference
-    table = read_table(path, ())
-    if "marker" in table.column_names:
-        return _from_markers(fits, table, path, wing)
-    return _from_shapes(fits, table, path)
+    good = [fit for fit in fits if fit.converged]
+    if not good:
+        return None
+    variance = [np.column_stack([fit.sigma_position_m, fit.sigma_twist_rad]) ** 2 for fit in good]
+    sigma = np.sqrt(np.mean(variance, axis=0) / len(good))
+    response = None if shared is None else shared.of_shapes(half, good).mean(axis=0)
+    if response is not None and not same:
+        sigma, response = np.hypot(sigma, sigma_of(response)), None
+    position_m, twist_rad = ([getattr(fit, what) for fit in good] for what in ("position_m", "twist_rad"))
+    return ReferenceShape(name, np.mean(position_m, axis=0), np.mean(twist_rad, axis=0), sigma, response)
 
 
-def _from_window(fits: Mapping[str, SideFits], window: Window) -> dict[str, SideFits]:
-    start = min(int(side.timestamp_ns.min()) for side in fits.values())
-    name = f"mean of {window.begin_s:g} to {window.end_s:g} s"
-    referred = {}
-    for side, own in fits.items():
-        since = (own.timestamp_ns - start) * 1e-9
-        chosen = own.converged & (since >= window.begin_s) & (since <= window.end_s)
-        if not chosen.any():
-            raise UsageError(
-                f"--reference-window {window.begin_s:g}:{window.end_s:g}: no set of the {side} wing was fitted in it "
-                f"(the recording has {since.min():.1f} to {since.max():.1f} s)"
-            )
-        referred[side] = _referred(own, own.xyz_m[chosen], own.twist_rad[chosen], name)
-    return referred
+def recorded(table: pa.Table, path: Path, side: str, half: HalfWing) -> ReferenceShape:
+    """The mean of another result's shape table, read from ``path``.
 
-
-def _from_markers(fits: Mapping[str, SideFits], table: pa.Table, path: Path, wing: Wing) -> dict[str, SideFits]:
-    at_rest = fit_series(marker_series(table, str(path)), wing, workers=1)
-    referred = {}
-    for side, own in fits.items():
-        if side not in at_rest or not at_rest[side].converged.any():
-            reason = at_rest[side].reason[0] if side in at_rest else "it has none of its markers"
-            raise UsageError(f"{path}: the {side} wing at rest could not be fitted ({reason})")
-        there = at_rest[side]
-        referred[side] = _referred(own, there.xyz_m[there.converged], there.twist_rad[there.converged], f"{path}")
-    return referred
-
-
-def _from_shapes(fits: Mapping[str, SideFits], table: pa.Table, path: Path) -> dict[str, SideFits]:
+    What errors it shares with the recording at hand is not known, so its sigma counts as the mean's own, in full.
+    Raises UsageError when it has no fitted set of this side, or other stations.
+    """
     shapes = shape_series(table, str(path))
-    referred = {}
-    for side, own in fits.items():
-        if side not in shapes:
-            raise UsageError(f"{path}: has no {side} wing; give a reference with every wing of this recording")
-        there = shapes[side]
-        if there.s_m.shape != own.s_m.shape or np.abs(there.s_m - own.s_m).max() > 1e-6:
-            raise UsageError(f"{path}: has other stations; fit the reference with the same wing file")
-        fitted = np.isfinite(there.xyz_m).all(axis=(1, 2))
-        if not fitted.any():
-            raise UsageError(f"{path}: no set of the {side} wing was fitted in it")
-        referred[side] = _referred(own, there.xyz_m[fitted], np.radians(there.twist_deg[fitted]), f"mean of {path}")
-    return referred
-
-
-def _referred(fits: SideFits, xyz_m: Floats, twist_rad: Floats, name: str) -> SideFits:
-    return replace(fits, reference=name, reference_xyz_m=xyz_m.mean(axis=0), reference_twist_rad=twist_rad.mean(axis=0))
+    if side not in shapes:
+        raise UsageError(f"{path}: has no {side} wing; give a reference with every wing of this recording")
+    there = shapes[side]
+    if there.s_m.shape != half.node_s_m.shape or np.abs(there.s_m - half.node_s_m).max() > 1e-6:
+        raise UsageError(f"{path}: has other stations; fit the reference with the same wing file")
+    fitted = np.isfinite(there.xyz_m).all(axis=(1, 2))
+    if not fitted.any():
+        raise UsageError(f"{path}: no set of the {side} wing was fitted in it")
+    sigma = np.concatenate([there.sigma_xyz_m, np.radians(there.sigma_twist_deg)[:, :, None]], axis=2)[fitted]
+    known = np.sqrt(np.mean(np.where(np.isfinite(sigma), sigma, 0.0) ** 2, axis=0))
+    mean_twist = np.radians(there.twist_deg[fitted].mean(axis=0))
+    return ReferenceShape(f"mean of {path}", there.xyz_m[fitted].mean(axis=0), mean_twist, known, None)

@@ -11,6 +11,7 @@ from reconstruct.tables import (
     FRAMES,
     LOAD_COLUMNS,
     LOADS,
+    MOVED,
     NET_COLUMNS,
     POSITION,
     REFERENCE_POSITION,
@@ -48,6 +49,12 @@ def shape_table(fits: SideFits) -> pa.Table:
             "twist_deg": np.degrees(fits.twist_rad).ravel(),
             **_flat(SIGMA, fits.sigma_xyz_m),
             "sigma_twist_deg": np.degrees(fits.sigma_twist_rad).ravel(),
+            **_flat([f"noise_{name}" for name in SIGMA], fits.noise_sigma_xyz_m),
+            "noise_sigma_twist_deg": np.degrees(fits.noise_sigma_twist_rad).ravel(),
+            **_flat(MOVED, fits.xyz_m - fits.reference_xyz_m),
+            "twisted_deg": np.degrees(fits.twist_rad - fits.reference_twist_rad).ravel(),
+            **_flat([f"sigma_{name}" for name in MOVED], fits.sigma_moved_m),
+            "sigma_twisted_deg": np.degrees(fits.sigma_twisted_rad).ravel(),
             **_flat(CURVATURE, fits.curvature_1pm),
             **_flat([f"sigma_{name}" for name in CURVATURE], fits.sigma_curvature_1pm),
             "flags": _text(np.repeat(fits.flags, fits.s_m.size)),
@@ -59,7 +66,7 @@ def frames_table(fits: SideFits) -> pa.Table:
     """One row a trigger: the tip, the net load, how well the fit agrees with its markers."""
     twist = np.degrees((fits.twist_rad - fits.reference_twist_rad)[:, -1])
     tip = np.column_stack([(fits.xyz_m - fits.reference_xyz_m)[:, -1], twist])
-    sigma_tip = np.column_stack([fits.sigma_xyz_m[:, -1], np.degrees(fits.sigma_twist_rad[:, -1])])
+    sigma_tip = np.column_stack([fits.sigma_moved_m[:, -1], np.degrees(fits.sigma_twisted_rad[:, -1])])
     residual = np.where(fits.used, np.linalg.norm(fits.residual_m, axis=-1), np.nan)
     return pa.table(
         {

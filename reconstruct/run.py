@@ -19,11 +19,12 @@ from process.tables import write_table
 from reconstruct.compare import Comparison, compare
 from reconstruct.identify import identify
 from reconstruct.iteration import FEWEST_MARKERS
-from reconstruct.reference import Reference, refer
+from reconstruct.reference import Reference
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_result
 from reconstruct.result_tables import result_tables
 from reconstruct.series import SideFits, fit_series
+from reconstruct.shared import shared_errors
 from reconstruct.summary import summarise
 from reconstruct.tables import MARKERS, UNLOADED, marker_series, read_table, write_csv
 from reconstruct.wing import Wing, read_wing
@@ -66,8 +67,14 @@ def run_job(job: Job, progress: Progress) -> tuple[dict[str, Any], tuple[str, ..
         done += count
         progress("fit", done, total)
 
-    fits = refer(
-        fit_series(series, wing, smooth_s=job.smooth_s, workers=job.workers, progress=fitted), job.reference, wing
+    fits = fit_series(
+        series,
+        wing,
+        shared=shared_errors(table),
+        reference=job.reference,
+        smooth_s=job.smooth_s,
+        workers=job.workers,
+        progress=fitted,
     )
     fit_end = time.monotonic()
     _write_tables(job, table, fits, inputs)

@@ -38,8 +38,8 @@ def _figures(sides: list[SideFits]) -> dict[str, Any]:
     fitted = np.concatenate([side.converged for side in sides])
     chi2, dof = (np.concatenate([getattr(side, name) for side in sides]) for name in ("chi2", "dof"))
     outlier = np.isfinite(residual) & ~used
-    tip = np.concatenate([np.linalg.norm(side.sigma_xyz_m[:, -1], axis=-1) for side in sides])
-    twist = np.degrees(np.concatenate([side.sigma_twist_rad[:, -1] for side in sides]))
+    tip = np.concatenate([np.linalg.norm(side.sigma_moved_m[:, -1], axis=-1) for side in sides])
+    twist = np.degrees(np.concatenate([side.sigma_twisted_rad[:, -1] for side in sides]))
     return {
         "sets": int(fitted.size),
         "converged_percent": float(100 * fitted.mean()),

@@ -29,6 +29,7 @@ UNLOADED = "unloaded.parquet"
 POSITION = ("x_m", "y_m", "z_m")
 COVARIANCE = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
 SIGMA = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
+MOVED = ("dx_m", "dy_m", "dz_m")
 TIP_COLUMNS = ("tip_dx_m", "tip_dy_m", "tip_dz_m", "tip_twist_deg")
 CURVATURE = ("curvature_twist_1pm", "curvature_out_1pm", "curvature_in_1pm")
 REFERENCE_POSITION = ("reference_x_m", "reference_y_m", "reference_z_m")

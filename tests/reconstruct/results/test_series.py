@@ -12,8 +12,8 @@ import pytest
 
 from capture.errors import UsageError
 from process.reference import Window, rest_shape
+from process.tables import MARKER_SCHEMA
 from reconstruct.instants import InstantSettings, at_common_instant
-from reconstruct.reference import refer
 from reconstruct.result_tables import frames_table, result_tables
 from reconstruct.series import BLOCK_SETS, fit_series
 from reconstruct.tables import marker_series
@@ -193,15 +193,16 @@ def still(bending_wing: Any, wing_file: Path) -> Any:
     """At rest, bent by 0.2 rad and twisted by 1°, for a second; then 0.1 rad more."""
     wing = bending_wing(bend_rad=lambda t: np.where(t < 0.99, 0.2, 0.3), twist_rad=lambda t: np.radians(1.0) + 0 * t)
     table = wing.marker_table(np.arange(50) * 0.04, row_offset_s=0.0)
-    return wing, fit_series(marker_series(table, "made"), read_wing(wing_file), workers=1)
+    markers = marker_series(table, "made")
+    return wing, lambda reference: fit_series(markers, read_wing(wing_file), reference=reference, workers=1)
 
 
 class TestReference:
     """Displacements are counted from what the user says, and say so."""
 
-    def test_a_window_at_rest(self, still: Any, wing_file: Path) -> None:
-        wing, fits = still
-        referred = refer(fits, Window(0.0, 0.9), read_wing(wing_file))
+    def test_a_window_at_rest(self, still: Any) -> None:
+        wing, fitted = still
+        referred = fitted(Window(0.0, 0.9))
         tip = frames_table(referred["right"])
         assert referred["right"].reference == "mean of 0 to 0.9 s"
         assert np.abs(tip.column("tip_dz_m").to_numpy()[:20]).max() < 1e-4
@@ -209,32 +210,34 @@ class TestReference:
         bent, _ = truth(wing, "right", np.array([3.0]), np.array([0.0, 1.9]))
         assert tip.column("tip_dz_m").to_numpy()[-3] == pytest.approx(bent[1, 0, 2] - bent[0, 0, 2], abs=1e-3)
 
-    def test_another_result(self, still: Any, tmp_path: Path, wing_file: Path) -> None:
-        _, fits = still
+    def test_another_result(self, still: Any, tmp_path: Path) -> None:
+        _, fitted = still
+        fits = fitted(None)
         pyarrow.parquet.write_table(result_tables(fits)["shape.parquet"], tmp_path / "shape.parquet")
-        referred = refer(fits, tmp_path, read_wing(wing_file))
+        referred = fitted(tmp_path)
         assert referred["left"].reference == f"mean of {tmp_path / 'shape.parquet'}"
         assert referred["left"].reference_xyz_m == pytest.approx(fits["left"].xyz_m.mean(axis=0))
 
-    def test_markers_at_rest(self, still: Any, tmp_path: Path, wing_file: Path) -> None:
-        wing, fits = still
+    def test_markers_at_rest(self, still: Any, tmp_path: Path) -> None:
+        wing, fitted = still
         path = tmp_path / "reference.parquet"
         table = wing.marker_table(np.arange(20) * 0.04, row_offset_s=0.0)
-        for name in ("u0_px", "v0_px", "u1_px", "v1_px", "epipolar_px"):
-            table = table.append_column(name, pa.array(np.zeros(table.num_rows)))
+        for missing in MARKER_SCHEMA:
+            if missing.name not in table.column_names:
+                table = table.append_column(missing, pa.array(np.zeros(table.num_rows)).cast(missing.type))
         pyarrow.parquet.write_table(rest_shape(table, None, 1e-3), path)
-        referred = refer(fits, path, read_wing(wing_file))
+        referred = fitted(path)
         assert referred["left"].reference == str(path)
         tip = frames_table(referred["right"])
         assert np.abs(tip.column("tip_dz_m").to_numpy()[:20]).max() < 1e-4
         lone = rest_shape(table.filter(pc.equal(table.column("side"), "left")), None, 1e-3)
         pyarrow.parquet.write_table(lone, path)
-        with pytest.raises(UsageError, match="the right wing at rest could not be fitted"):
-            refer(fits, path, read_wing(wing_file))
+        with pytest.raises(UsageError, match="has no right wing"):
+            fitted(path)
 
-    def test_a_window_without_sets(self, still: Any, wing_file: Path) -> None:
+    def test_a_window_without_sets(self, still: Any) -> None:
         with pytest.raises(UsageError, match=r"no set of the (left|right) wing was fitted in it"):
-            refer(still[1], Window(10.0, 12.0), read_wing(wing_file))
+            still[1](Window(10.0, 12.0))
 
 
 class TestSmoothing:
