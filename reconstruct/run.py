@@ -15,6 +15,7 @@ from capture.errors import ReconstructError, UsageError
 from process.camera_model import Rig
 from process.json_file import provenance, write_json
 from process.pipeline import markers as measure_markers
+from process.shared_error import with_rig
 from process.tables import write_table
 from reconstruct.compare import Comparison, compare
 from reconstruct.identify import identify
@@ -127,7 +128,7 @@ def _measure(job: Job, progress: Progress) -> tuple[pa.Table, str, list[Path], t
     found = measure_markers(
         job.flights, rig, progress=lambda done, total: progress("markers", done, total), workers=job.workers
     )
-    return found.table, " ".join(str(path) for path in job.flights), [job.wing, job.rig], found.problems
+    return with_rig(found.table, rig), " ".join(str(path) for path in job.flights), [job.wing, job.rig], found.problems
 
 
 def _warnings(wing: Wing, fits: dict[str, SideFits]) -> list[str]:

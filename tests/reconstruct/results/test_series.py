@@ -224,7 +224,7 @@ class TestReference:
         table = wing.marker_table(np.arange(20) * 0.04, row_offset_s=0.0)
         for missing in MARKER_SCHEMA:
             if missing.name not in table.column_names:
-                table = table.append_column(missing, pa.array(np.zeros(table.num_rows)).cast(missing.type))
+                table = table.append_column(missing, pa.array(np.zeros(table.num_rows, int)).cast(missing.type))
         pyarrow.parquet.write_table(rest_shape(table, None, 1e-3), path)
         referred = fitted(path)
         assert referred["left"].reference == str(path)
