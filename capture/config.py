@@ -74,6 +74,7 @@ class CameraDefaults(_Table):
     height: Annotated[int, Field(gt=0, le=16384)] = 1552
     exposure_us: Annotated[int, Field(gt=0, le=1_000_000)] = 2000
     gain_db: float = 0.0
+    row_time_us: Annotated[float | None, Field(ge=0, le=1000)] = None  # None: as the camera says, if it does
     trigger_latency_us: Annotated[float, Field(ge=0)] = 0.0  # from trigger to exposure, by the camera's data sheet
     time_sigma_limit_us: Annotated[float, Field(gt=0)] = 50.0  # of a frame's instant; beyond it, a gate fails
 

@@ -11,12 +11,12 @@ from typing import Any
 
 from capture.analog import AnalogLog
 from capture.aux_log import AuxLog, Companion
-from capture.camera import make_camera
 from capture.camera.base import Camera, CameraDescription
+from capture.camera_place import camera_at, open_at
 from capture.clock import Clock
 from capture.config import Config, LoadedConfig
 from capture.disk import Disk
-from capture.errors import CameraError, DiskError, TriggerBoardError
+from capture.errors import DiskError, TriggerBoardError
 from capture.flight import metadata_yaml
 from capture.gates import Gates, judge_cameras, judge_clock
 from capture.grabber import STOP_DEADLINE_S, Absence, Grabber
@@ -221,21 +221,9 @@ class Recording:
 
     def _open_cameras(self, cleanup: contextlib.ExitStack) -> None:
         for place in self._config.cameras:
-            name = f"{place.side}/{place.name}"
-            camera = make_camera(self._config.camera.backend, place.address, self._config.settings)
+            camera = camera_at(self._config, place)
             cleanup.callback(camera.close)
-            try:
-                description = camera.open()
-            except CameraError as error:
-                raise CameraError(f"{name}: {error}") from error
-            if place.serial is not None and place.serial != description.serial:
-                raise CameraError(
-                    f"{name}: serial {description.serial} answers at {place.address}, not {place.serial}: "
-                    "swap the cables, or the serials in the configuration"
-                )
-            if not description.hardware_trigger:
-                raise CameraError(f"{name}: {description.model} has no hardware trigger: it cannot be synchronised")
-            self._cameras[place.side, place.name] = (camera, description)
+            self._cameras[place.side, place.name] = (camera, open_at(camera, self._config, place))
 
     def _make_lanes(self, board_name: str) -> None:
         parts = LaneParts(

@@ -1,7 +1,7 @@
 """A frame set to its times: the set's common instant, each marker's own by its row, and how well they are known.
 
-A rolling shutter exposes row r ``r · row_time`` after row 0. What is not known of the row time by the recording is
-taken from the rig.
+A rolling shutter exposes row r ``r · row_time`` after row 0; of a global one the row time is 0, in the recording and in
+the rig. What the recording does not know of the row time is taken from the rig.
 """
 
 import math
@@ -43,12 +43,9 @@ def marker_instants_ns(
 
 
 def row_times_ns(frames: FrameSet, side: RigSide) -> tuple[float, float]:
-    """Of each camera: as recorded, or the rig's where the recording does not say."""
-    frame0, frame1 = frames.frames
-    return (
-        side.row_time_ns if frame0 is None else float(frame0.row_time_ns),
-        side.row_time_ns if frame1 is None else float(frame1.row_time_ns),
-    )
+    """Of each camera: as recorded, or the rig's where the recording does not say (0: few cameras know their own)."""
+    frame0, frame1 = (0.0 if frame is None else float(frame.row_time_ns) for frame in frames.frames)
+    return frame0 or side.row_time_ns, frame1 or side.row_time_ns
 
 
 def time_sigma_ns(frames: FrameSet) -> float:
