@@ -129,6 +129,7 @@ def _rest(rows: dict[str, Any], marker: int) -> dict[str, Any]:
     middle_ns = int(rows["frame_timestamp_ns"].min() // 2 + rows["frame_timestamp_ns"].max() // 2)
     row: dict[str, Any] = dict.fromkeys(REFERENCE_SCHEMA.names, np.nan)
     row |= {**first, "marker": marker, "timestamp_ns": middle_ns, "frame_timestamp_ns": middle_ns, "sets": 0}
+    row["ptp_state"] = ""  # a window has none
     xyz, covariance = _places(rows)
     good = (rows["marker"] == marker) & np.isfinite(xyz).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     good &= np.array(["ambiguous" not in flags for flags in rows["flags"]], dtype=bool)
