@@ -95,7 +95,8 @@ def rest_shape(markers: pa.Table, window: Window | None, still_m: float) -> pa.T
     """
     if markers.num_rows == 0:
         raise ProcessError("the marker table has no rows: no reference can be taken from it")
-    columns = {name: markers.column(name).to_numpy(zero_copy_only=False) for name in MARKER_SCHEMA.names}
+    known = [name for name in MARKER_SCHEMA.names if name in markers.column_names]
+    columns = {name: markers.column(name).to_numpy(zero_copy_only=False) for name in known}
     since_s = (columns["frame_timestamp_ns"] - columns["frame_timestamp_ns"].min()) * 1e-9
     chosen = (since_s >= window.begin_s) & (since_s < window.end_s) if window else np.ones(len(since_s), bool)
     sides = sides_of(markers)
