@@ -40,6 +40,8 @@ def marker_table(places, sets=200, seed=1, path_m=None, side="right"):
         **{name: np.zeros(sets * count) for name in ("u0_px", "v0_px", "u1_px", "v1_px", "epipolar_px")},
         "flags": np.full(sets * count, "", dtype=object),
     }
+    rows = len(columns["side"])
+    columns |= {"time_sigma_ns": np.zeros(rows), "ptp_state": np.full(rows, "SLAVE")}
     return pa.table([pa.array(columns[name]) for name in MARKER_SCHEMA.names], schema=MARKER_SCHEMA)
 
 
