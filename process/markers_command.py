@@ -19,9 +19,11 @@ from capture.console import note, say, say_json
 from capture.errors import ProcessError, UsageError
 from process.camera_model import Rig
 from process.detect import DetectSettings
+from process.drift import drift, drift_path, worst
 from process.match import MatchSettings
 from process.pipeline import MarkersResult, PipelineSettings
 from process.pipeline import markers as run_pipeline
+from process.recording import open_recording
 from process.shared_error import with_rig
 from process.signal_table import MAX_GAP_S, sets_of, signal_table, signals_path
 from process.signals import read_signals
@@ -98,7 +100,10 @@ def markers(
     write_table(with_rig(result.table, cameras), output, command=command, inputs=[rig])
     beside = signal_table(sets_of(result.table), signals, max_gap)
     write_table(beside, signals_path(output), command=command, inputs=dbc or ())
-    summary = summarise(result) | {"signals": [signal.name for signal in signals.signals]}
+    recording = open_recording(flight) if cameras.left.references or cameras.right.references else None
+    moved = drift(result.table, recording, cameras)
+    write_table(moved, drift_path(output), command=command, inputs=[rig])
+    summary = summarise(result) | {"drift": worst(moved), "signals": [signal.name for signal in signals.signals]}
     problems = (*result.problems, *signals.problems)
     if json:
         say_json(
@@ -143,10 +148,19 @@ def _print(summary: dict[str, Any], output: Path) -> None:
     for title, counts in (("flags", summary["flags"]), ("turned down", summary["rejected_blobs"])):
         if counts:
             say(f"{title:<15} " + ", ".join(f"{reason} {count}" for reason, count in counts.items()))
+    for side, found in summary["drift"].items():
+        _print_drift(side, found)
     if summary["signals"]:
         say(f"signals         {len(summary['signals'])}: {', '.join(summary['signals'])}")
     say(f"rate            {summary['frame_sets_per_s']:.1f} frame sets/s ({summary['seconds']:.1f} s)")
     say(f"written         {output}")
+
+
+def _print_drift(side: str, found: dict[str, float]) -> None:
+    for name, what in (("epipolar", "epipolar residual"), ("lights", "fuselage lights")):
+        if f"{name}_px" in found:
+            tip, sigma = found[f"{name}_tip_mm"], found[f"{name}_tip_sigma_mm"]
+            say(f"{'drift ' + side:<15} {what} {found[f'{name}_px']:+.3f} px: {tip:.2f} +- {sigma:.2f} mm at the tip")
 
 
 @contextmanager

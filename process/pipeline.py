@@ -23,6 +23,7 @@ from process.bulb import centres_m, wing_normals
 from process.camera_model import MarkerLayout, Rig, RigSide
 from process.detect import Detections, DetectSettings, detect
 from process.flight_cameras import check_cameras
+from process.fuselage_lights import without_lights
 from process.match import UNSEEN, Matches, MatchSettings, Track, match
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
 from process.set_time import marker_instants_ns, ptp_state, set_instant_ns, time_sigma_ns
@@ -223,6 +224,7 @@ def _process_set(
         for rejected in spots.rejected:
             reason = rejected.reason.split(":")[0]
             block.rejected[reason] = block.rejected.get(reason, 0) + 1
+    found = without_lights(side, found)
     matched = match(frames.side, side, rig.markers, found, frames.trigger_index, track, settings.matching)
     _append(block, frames, side, matched, found, settings, rig.markers)
     return matched.track or track

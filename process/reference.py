@@ -106,17 +106,17 @@ def rest_shape(markers: pa.Table, window: Window | None, still_m: float) -> pa.T
         sets = len(np.unique(columns["trigger_index"][mine]))
         if sets < FEWEST_SETS:
             raise ProcessError(_too_few(side, sets, window, float(since_s.max())))
-        there = [
+        rests = [
             _rest({name: values[mine] for name, values in columns.items()}, marker)
             for marker in np.unique(columns["marker"][columns["side"] == side])
         ]
-        places = np.array([[row[f"{axis}_m"] for axis in "xyz"] for row in there])
-        shared = np.full((len(there), 3, 3), np.nan)
+        places = np.array([[row[f"{axis}_m"] for axis in "xyz"] for row in rests])
+        shared = np.full((len(rests), 3, 3), np.nan)
         if side in sides:
             shared = point_covariance_m2(sides[side], places)
-        for row, covariance in zip(there, shared, strict=True):
+        for row, covariance in zip(rests, shared, strict=True):
             row.update({f"shared_{axes}_m2": covariance[at] for axes, at in zip(_AXES, _TRIANGLE, strict=True)})
-        rows += there
+        rows += rests
     _refuse_motion(rows, still_m)
     table = pa.Table.from_pylist(rows, schema=REFERENCE_SCHEMA)
     note = {"window_s": None if window is None else [window.begin_s, window.end_s]}
@@ -126,7 +126,7 @@ def rest_shape(markers: pa.Table, window: Window | None, still_m: float) -> pa.T
 
 def _rest(rows: dict[str, Any], marker: int) -> dict[str, Any]:
     """The row of one marker, from its rows in the window."""
-    first = {name: rows[name][0] for name in ("trigger_index", "side")}
+    first = {name: rows[name][0] for name in ("trigger_index", "side")} | {"ptp_state": rows.get("ptp_state", [""])[0]}
     middle_ns = int(rows["frame_timestamp_ns"].min() // 2 + rows["frame_timestamp_ns"].max() // 2)
     row: dict[str, Any] = dict.fromkeys(REFERENCE_SCHEMA.names, np.nan)
     row |= {**first, "marker": marker, "timestamp_ns": middle_ns, "frame_timestamp_ns": middle_ns, "sets": 0}
@@ -146,6 +146,7 @@ def _rest(rows: dict[str, Any], marker: int) -> dict[str, Any]:
     row |= {f"{axis}_m": value for axis, value in zip("xyz", mean, strict=True)}
     row |= {f"cov_{axes}_m2": of_mean[at] for axes, at in zip(_AXES, _TRIANGLE, strict=True)}
     row |= {name: float(rows[name][good].mean()) for name in ("u0_px", "v0_px", "u1_px", "v1_px", "epipolar_px")}
+    row["time_sigma_ns"] = float(np.max(rows["time_sigma_ns"][good])) if "time_sigma_ns" in rows else np.nan
     scatter_m = float(np.sqrt(np.mean(np.sum((xyz[good] - mean) ** 2, axis=1))))
     # what is left of the parts' spread once noise is taken off
     moved_m2 = float(np.mean(np.sum(spread**2, axis=1))) - float(np.trace(noise)) * len(parts) / int(good.sum())

@@ -34,6 +34,8 @@ def marker_table(places, sets=200, seed=1, path_m=None, side="right"):
         "marker": np.tile(np.arange(count), sets).astype(np.int32),
         "timestamp_ns": times,
         "frame_timestamp_ns": times,
+        "time_sigma_ns": np.full(sets * count, 1000.0),
+        "ptp_state": np.full(sets * count, "", dtype=object),
         **{f"{axis}_m": xyz[..., k].ravel() for k, axis in enumerate("xyz")},
         **{f"cov_{axes}_m2": np.zeros(sets * count) for axes in ("xy", "xz", "yz")},
         **{f"cov_{a}{a}_m2": np.full(sets * count, SIGMA_M[k] ** 2) for k, a in enumerate("xyz")},
