@@ -126,7 +126,7 @@ def rest_shape(markers: pa.Table, window: Window | None, still_m: float) -> pa.T
 
 def _rest(rows: dict[str, Any], marker: int) -> dict[str, Any]:
     """The row of one marker, from its rows in the window."""
-    first = {name: rows[name][0] for name in ("trigger_index", "side")} | {"ptp_state": rows.get("ptp_state", [""])[0]}
+    first = {name: rows[name][0] for name in ("trigger_index", "side")}
     middle_ns = int(rows["frame_timestamp_ns"].min() // 2 + rows["frame_timestamp_ns"].max() // 2)
     row: dict[str, Any] = dict.fromkeys(REFERENCE_SCHEMA.names, np.nan)
     row |= {**first, "marker": marker, "timestamp_ns": middle_ns, "frame_timestamp_ns": middle_ns, "sets": 0}
