@@ -18,10 +18,11 @@ from capture.companions import make_companions
 from capture.config import load_config
 from capture.console import Narrator, run, say, say_json
 from capture.daemon import Recording, RecordingResult, StopRule
+from capture.devices_command import devices
 from capture.disk import SystemDisk
 from capture.errors import CaptureError, UsageError
+from capture.finding import Finding, Situation
 from capture.health_writer import HealthWriter
-from capture.preflight import Finding, Situation
 from capture.preflight import preflight as run_checks
 from capture.recover import recover_flight
 from capture.verify import FlightReport, inspect
@@ -87,6 +88,9 @@ def preflight(
         raise CaptureError(f"NO GO, {len(refused)} of {len(findings)} checks refuse: {reasons}")
     if not json:
         say(f"GO: {len(findings)} checks")
+
+
+app.command()(devices)
 
 
 @app.command()

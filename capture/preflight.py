@@ -4,13 +4,12 @@ A check changes nothing for good and takes seconds. The table ``CHECKS`` is the 
 """
 
 import datetime
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterator, Mapping
 
-from capture.clock import EARLIEST_NS, Clock
-from capture.config import Config
+from capture.camera_checks import check_calibration, check_cameras, check_usb
+from capture.clock import EARLIEST_NS
 from capture.errors import CaptureError
+from capture.finding import Check, Finding, Situation
 from capture.ptp import POLL_S, PtpWatch
 from capture.trigger import TriggerBoard
 
@@ -23,39 +22,6 @@ PTP_REMEDIES = {
     "ptp.utc": "give the grandmaster a time source, or tell it: pmc 'SET GRANDMASTER_SETTINGS_NP …'",
     "ptp.phc": "see `journalctl -u phc2sys`",
 }
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What one check found."""
-
-    name: str
-    ok: bool
-    found: str  # with its figures
-    remedy: str = ""  # what to do, where it is not in order
-    numbers: Mapping[str, Any] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For ``--json``."""
-        return {
-            "name": self.name,
-            "ok": self.ok,
-            "found": self.found,
-            "remedy": self.remedy,
-            "numbers": dict(self.numbers),
-        }
-
-
-@dataclass(frozen=True)
-class Situation:
-    """What a check may look at."""
-
-    config: Config
-    clock: Clock
-
-
-Check = Callable[[Situation], list[Finding]]
-"""Looks at one thing and says what it found, good or bad. A CaptureError that it raises is a finding too."""
 
 
 def check_clock(situation: Situation) -> list[Finding]:
@@ -105,6 +71,9 @@ CHECKS: Mapping[str, Check] = {
     "clock": check_clock,
     "ptp": check_ptp,
     "trigger board": check_board,
+    "usb": check_usb,
+    "cameras": check_cameras,
+    "calibration": check_calibration,
 }
 
 

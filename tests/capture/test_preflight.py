@@ -5,7 +5,8 @@ import json
 from capture.clock import SystemClock
 from capture.config import load_config
 from capture.errors import DiskError
-from capture.preflight import CHECKS, Finding, Situation, check_clock, preflight
+from capture.finding import Finding, Situation
+from capture.preflight import CHECKS, check_clock, preflight
 
 
 class ClockOf1970(SystemClock):

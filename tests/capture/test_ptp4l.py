@@ -14,7 +14,8 @@ from capture.clock import SystemClock
 from capture.config import PtpConfig, load_config
 from capture.daemon import Recording, StopRule
 from capture.disk import SystemDisk
-from capture.preflight import Situation, check_ptp
+from capture.finding import Situation
+from capture.preflight import check_ptp
 from capture.ptp import PtpWatch, read_ptp
 from capture.record import GATE_TOPIC, PTP_TOPIC, Frame, Gate, Ptp, PtpState
 from capture.scan import scan
