@@ -63,11 +63,11 @@ def model(camera: CameraTruth) -> CameraModel:
     return CameraModel.from_intrinsics(2080, 1552, [camera.fx, camera.fy, camera.cx, camera.cy, *lens])
 
 
-def rig_side(cameras: list[CameraTruth]) -> RigSide:
-    """The rig's file of these cameras, without an error."""
+def rig_side(cameras: list[CameraTruth], row_time_ns: int) -> RigSide:
+    """The rig's file of these cameras, without an error but that of its row time."""
     pose0, pose1 = (np.array(camera.T_body_cam) for camera in cameras)
     pair = StereoPair(model(cameras[0]), model(cameras[1]), np.linalg.inv(pose1) @ pose0)
-    return RigSide(pair, pose0, "0", "1", ROW_TIME_NS)
+    return RigSide(pair, pose0, "0", "1", row_time_ns)
 
 
 def seen(leds: LedMotion, camera: CameraTruth, mid_ns: int) -> NDArray[np.float64]:
@@ -89,7 +89,7 @@ def frame(index: int, mid_ns: int, row_time_ns: int) -> Frame:
 def marker_table(world: World, row_time_ns: int) -> pa.Table:
     """What ``wingproc markers`` makes of it, told that a row takes ``row_time_ns``."""
     cameras = [world.camera(SIDE, name) for name in ("cam0", "cam1")]
-    side, leds = rig_side(cameras), LedMotion(world, SIDE)
+    side, leds = rig_side(cameras, row_time_ns), LedMotion(world, SIDE)
     noise = np.tile(np.eye(2) * 0.05**2, (len(leds), 1, 1))
     parts = []
     for index in range(SETS):
