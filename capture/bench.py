@@ -124,9 +124,9 @@ class ClockedTriggers:
         index = (time_ns - self.start_ns) // self.period_ns
         return index, self.start_ns + index * self.period_ns
 
-    def reported(self, index: int) -> bool:
-        """Always."""
-        return True
+    def time_of(self, index: int, log_ns: int) -> tuple[int, bool]:
+        """As it was told."""
+        return log_ns, True
 
 
 class ClockedCamera(Camera):

@@ -92,6 +92,7 @@ class ClockFit:
         self._frames = self._outliers = self._steps = 0
         self._noise, self._noise_frames = FIRST_TRIGGER_NS**2, 0
         self._astray: list[float] = []  # the outliers in a row just now
+        self._guessed = False  # it rests on reckoned times
         self._offset, self._variance = 0.0, FIRST_GUESS_NS**2
         self._floor = _Floor()
 
@@ -113,12 +114,12 @@ class ClockFit:
             filter.predict(dt_s)
         self._mix()
         nominal_ns = self._nominal_ns(ticks)
-        doubt = 0.0
-        if reported:
-            doubt = self._take_trigger(float(trigger_ns - nominal_ns))
+        offset_ns = float(trigger_ns - nominal_ns)
+        doubt = self._take_trigger(offset_ns) if reported else self._take_guess(offset_ns)
         late_ns = readout_end_ns - nominal_ns - self._offset
         error_ns = self._floor.feed(late_ns, reported and not doubt)
         if error_ns is not None:
+            self._guessed = False
             self._update(self._offset + error_ns, self._floor.variance)
         return self._instant(nominal_ns, doubt)
 
@@ -142,6 +143,7 @@ class ClockFit:
         """The first frame, or the device's clock was set anew."""
         self._steps += self._origin is not None
         self._origin, self._ticks = (ticks, trigger_ns), ticks
+        self._guessed = not reported
         variance = self._noise if reported else FIRST_GUESS_NS**2
         for filter in self._filters:
             filter.begin(0.0, variance, 0.0, FIRST_RATE_NS**2)
@@ -157,11 +159,24 @@ class ClockFit:
         if sigmas > OUTLIER:
             return self._doubt(innovation, expected)
         self._astray.clear()
+        self._guessed = False
         self._noise_frames = min(self._noise_frames + 1, NOISE_FRAMES)
         seen = min(innovation**2, 9 * expected) - self._variance
         self._noise = max(self._noise + (seen - self._noise) / (self._noise_frames + 4), LEAST_TRIGGER_NS**2)
         self._update(offset_ns, self._noise * max(1.0, sigmas / DOUBTFUL))
         return 0.0
+
+    def _take_guess(self, offset_ns: float) -> float:
+        """A reckoned time is better than a fit that runs away.
+
+        How far off the fit may be beyond its own variance, since such times are wrong together: while it rests on them.
+        """
+        if self._variance < (FIRST_GUESS_NS / 4) ** 2 or self._floor.carrying:
+            return FIRST_GUESS_NS if self._guessed else 0.0
+        self._guessed = True
+        if abs(offset_ns - self._offset) < OUTLIER * math.sqrt(self._variance + FIRST_GUESS_NS**2):
+            self._update(offset_ns, FIRST_GUESS_NS**2)
+        return FIRST_GUESS_NS
 
     def _doubt(self, innovation: float, expected: float) -> float:
         """An outlier. Several in a row that agree are a step of the device's clock."""

@@ -16,7 +16,7 @@ from capture.camera_place import camera_at, open_at
 from capture.clock import Clock
 from capture.config import Config, LoadedConfig
 from capture.disk import Disk
-from capture.errors import DiskError, TriggerBoardError
+from capture.errors import DiskError
 from capture.flight import metadata_yaml
 from capture.gates import Gates, judge_cameras, judge_clock
 from capture.grabber import STOP_DEADLINE_S, Absence, Grabber
@@ -25,16 +25,15 @@ from capture.lane import Lane, LaneParts, check_ring_memory, make_lane
 from capture.ledger import CameraAccount, Ledger, Place
 from capture.provenance import describe_cameras, describe_config, describe_host, describe_time
 from capture.ptp import FREE_RUNNING, PtpWatch
-from capture.record import SIDES, Diagnostic, Trigger
+from capture.record import SIDES, Diagnostic
 from capture.recorder import Recorder
-from capture.trigger import BoardCount, TriggerBoard, TriggerLog
-from capture.trigger_protocol import Pulse
+from capture.trigger import BoardCount, TriggerLog
+from capture.trigger_run import TriggerRun
 from capture.vitals import Vitals
 from capture.worker import share_interpreter
 
 CONTROL_PERIOD_S = 0.1
 DIAGNOSTICS_PERIOD_S = 1.0
-SILENT_BOARD_S = 2.0  # a running board that has reported no pulse for so long is asked
 DRAIN_DEADLINE_S = 2.0  # how long frames of the last triggers may take to arrive
 FLUSH_DEADLINE_S = 60.0  # how long the disks may take to write what is in the rings
 
@@ -132,8 +131,6 @@ class Recording:
         own = [companion for companion in (self._ptp, self._analog) if companion is not None]
         self._companions = (*own, *companions, self._gates)
         self._failures: list[str] = []
-        self._counter_before: int | None = None  # the board's, before our first pulse
-        self._pulse_s = 0.0  # when the last pulse was reported
         self._flight_id = f"{self.flight}-{clock.utc_ns():x}"
         places = [(camera.side, camera.name) for camera in self._config.cameras]
         self._ledger = Ledger(places, self._config.trigger.first_index, clock.utc_ns, self._aux.loss)
@@ -151,35 +148,42 @@ class Recording:
         with contextlib.ExitStack() as cleanup:
             cleanup.enter_context(self._watched())
             self._open_cameras(cleanup)
-            on_sample = self._analog.take if self._analog is not None else None
-            board = TriggerBoard(self._config.trigger.port, self._clock, self._on_pulse, on_sample)
-            cleanup.callback(board.close)
-            board.start()
-            name = board.hello()
-            before = board.end()  # it may still be running for a recorder that was killed
-            board.set_rate(self._config.trigger.rate_hz)
-            self._make_lanes(name)
+            run = self._make_run()
+            cleanup.callback(run.board.close)
+            self._make_lanes(run.open())
             self._show_frames()
-            self._counter_before = before.counter
             started_s = self._clock.monotonic_s()
             try:
                 for companion in self._companions:
                     companion.start(self._aux.put)
                 if self._analog is not None:
-                    self._analog.begin(board)
+                    self._analog.begin(run.board)
                 for lane in self._lanes.values():
                     lane.start()
-                board.begin(self._config.trigger.first_index, stop.triggers)
+                run.begin(stop.triggers)
                 self._vitals.begin(self._lanes)
-                self._control(board, stop, started_s)
+                self._control(run, stop, started_s)
             except Exception as error:  # whatever it is: what was recorded is closed and accounted for
                 self._failures.append(f"{type(error).__name__}: {error}")
             self._vitals.state = "stopping"
-            count = self._end_triggers(board)
+            count = run.end()
+            self._failures += [run.trouble] if run.trouble else []
             for companion in self._companions:
                 companion.stop()
             seconds = self._clock.monotonic_s() - started_s
-            return self._finish(before, count, seconds, board)
+            return self._finish(count, seconds, run)
+
+    def _make_run(self) -> TriggerRun:
+        return TriggerRun(
+            self._config.trigger,
+            self._clock,
+            self._triggers,
+            self._ledger,
+            self._aux,
+            self._gates,
+            on_sample=self._analog.take if self._analog else None,
+            on_restart=self._analog.begin if self._analog else None,
+        )
 
     @contextlib.contextmanager
     def _watched(self) -> Iterator[None]:
@@ -210,14 +214,6 @@ class Recording:
     @property
     def _recorders(self) -> dict[str, Recorder]:
         return {side: lane.recorder for side, lane in self._lanes.items()}
-
-    def _on_pulse(self, pulse: Pulse, trigger: Trigger) -> None:
-        if self._counter_before is None or pulse.counter <= self._counter_before:
-            return  # still of a recording before ours
-        self._pulse_s = self._clock.monotonic_s()
-        self._triggers.add(pulse)
-        self._ledger.triggered(pulse.index + 1)
-        self._aux.trigger(trigger)
 
     def _open_cameras(self, cleanup: contextlib.ExitStack) -> None:
         for place in self._config.cameras:
@@ -286,7 +282,7 @@ class Recording:
             ) from error
         return folder
 
-    def _control(self, board: TriggerBoard, stop: StopRule, started_s: float) -> None:
+    def _control(self, run: TriggerRun, stop: StopRule, started_s: float) -> None:
         next_report_s = started_s + DIAGNOSTICS_PERIOD_S
         while not stop.requested.wait(CONTROL_PERIOD_S):
             now_s = self._clock.monotonic_s()
@@ -298,51 +294,16 @@ class Recording:
                 return
             if stop.duration_s and now_s - started_s >= stop.duration_s:
                 return
-            if now_s - self._last_pulse_s(started_s) > self._silence_s and self._board_has_stopped(board, stop):
-                return
-            if board.error is not None:
-                self._failures.append(str(board.error))
+            over = run.watch()
+            if over is not None:
+                self._failures += [over] if over else []
                 return
             if all(recorder.failure is not None for recorder in self._recorders.values()):
                 return
             if not any(grabber.running for grabber in self._grabbers.values()):
                 return
 
-    @property
-    def _silence_s(self) -> float:
-        return max(SILENT_BOARD_S, 10 / self._config.trigger.rate_hz)
-
-    def _last_pulse_s(self, started_s: float) -> float:
-        return max(started_s, self._pulse_s)
-
-    def _board_has_stopped(self, board: TriggerBoard, stop: StopRule) -> bool:
-        """Ask a board that has been silent for long. One that has given all it was asked for is in order."""
-        self._pulse_s = self._clock.monotonic_s()
-        try:
-            running, count = board.status()
-        except TriggerBoardError as error:
-            self._failures.append(str(error))
-            return True
-        self._ledger.triggered(count.next_index)  # also those whose reports were lost
-        given = count.next_index - self._config.trigger.first_index
-        if stop.triggers and given >= stop.triggers:
-            return True
-        if not running:
-            self._failures.append(f"{board.port}: the trigger board has stopped by itself after {given} triggers")
-        return not running
-
-    def _end_triggers(self, board: TriggerBoard) -> BoardCount | None:
-        try:
-            return board.end()
-        except TriggerBoardError as error:
-            if board.error is None:
-                self._failures.append(str(error))
-            return None
-
-    def _finish(
-        self, before: BoardCount, count: BoardCount | None, seconds: float, board: TriggerBoard
-    ) -> RecordingResult:
-        first_index = self._config.trigger.first_index
+    def _finish(self, count: BoardCount | None, seconds: float, run: TriggerRun) -> RecordingResult:
         next_index = count.next_index if count else self._ledger.next_index
         self._ledger.triggered(next_index)
         deadline_s = self._clock.monotonic_s() + DRAIN_DEADLINE_S
@@ -365,15 +326,7 @@ class Recording:
             if recorder.error is not None:
                 self._failures.append(f"{recorder.name}: {recorder.error}")
         self._ledger.settle("the write thread ended before it came to this frame")
-        end = {
-            "first_index": str(first_index),
-            "next_index": str(next_index),
-            "counter_begin": str(before.counter),
-            "counter_end": str(count.counter if count else before.counter + next_index - first_index),
-            "board_confirmed": str(count is not None).lower(),
-            "triggers_reported": str(self._aux.triggers),
-            "aux_dropped": json.dumps(self._aux.dropped),
-        }
+        end = {**run.account(count), "aux_dropped": json.dumps(self._aux.dropped)}
         for companion in self._companions:
             end |= companion.account()
         last = self._aux.take()  # booked while the write threads ended
@@ -389,7 +342,7 @@ class Recording:
             if not account.balanced:
                 self._failures.append(f"{'/'.join(place)}: the books do not balance: {account}")
         self._write_metadata()
-        return self._result(next_index - first_index, seconds, board.garbled_lines)
+        return self._result(next_index - self._config.trigger.first_index, seconds, run.board.garbled_lines)
 
     def _write_metadata(self) -> None:
         writers = [writer for r in self._recorders.values() for writer in (*r.segments, r.aux)]

@@ -15,6 +15,7 @@ from capture.record import PtpState
 class FrameTime:
     """When a frame was exposed."""
 
+    trigger_ns: int  # UTC
     exposure_start_ns: int  # UTC, of row 0
     sigma_ns: int  # one sigma; -1: not known
     ptp_state: PtpState
@@ -39,15 +40,17 @@ class FrameClock:
 
     def time_of(self, grab: Grab, numbered: Numbered) -> FrameTime:
         """Take each frame once, in order."""
+        trigger_ns, reported = self._triggers.time_of(numbered.index, numbered.trigger_ns)
         found = self._fit.feed(
             grab.device_ticks,
-            numbered.trigger_ns + self._latency_ns,
-            self._triggers.reported(numbered.index),
+            trigger_ns + self._latency_ns,
+            reported,
             grab.receive_ns - grab.exposure_us * 1000 - self._readout_ns,
         )
         state = self._clock_state()
         sigma_ns = math.hypot(found.sigma_ns, state.sigma_ns)
-        return FrameTime(found.start_ns, -1 if math.isnan(sigma_ns) else math.ceil(sigma_ns), state.ptp_state)
+        known_ns = -1 if math.isnan(sigma_ns) else math.ceil(sigma_ns)
+        return FrameTime(trigger_ns, found.start_ns, known_ns, state.ptp_state)
 
     @property
     def figures(self) -> ClockFigures:

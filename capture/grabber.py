@@ -250,7 +250,7 @@ class Grabber(Worker):
             trigger_index=numbered.index,
             device_frame_id=grab.frame_id,
             device_ticks=grab.device_ticks,
-            trigger_time_ns=numbered.trigger_ns,
+            trigger_time_ns=time.trigger_ns,
             exposure_start_ns=time.exposure_start_ns,
             receive_time_ns=grab.receive_ns,
             time_sigma_ns=time.sigma_ns,

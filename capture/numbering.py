@@ -18,10 +18,10 @@ class Triggers(Protocol):
         """Index and time of the trigger nearest to ``time_ns``."""
 
     def latest_before(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
-        """Index and time of the last trigger at or before ``time_ns``."""
+        """Index and time of the last trigger at or before the UTC time ``time_ns``."""
 
-    def reported(self, index: int) -> bool:
-        """Whether the board itself has said when it gave this trigger."""
+    def time_of(self, index: int, log_ns: int) -> tuple[int, bool]:
+        """UTC of the trigger whose time was told as ``log_ns``, and whether the board itself has said it."""
 
 
 CONFIRMING = 4

@@ -24,31 +24,62 @@ from capture.trigger_protocol import (
 from capture.worker import Worker
 
 REPLY_TIMEOUT_S = 1.0
+RECONNECT_S = 0.25
 _PULSES_KEPT = 4096
+_STEPS_KEPT = 64
 
 
 class TriggerLog:
-    """Which trigger was given when. Thread-safe; remembers the last few thousand pulses."""
+    """Which trigger was given when. Thread-safe; remembers the last few thousand pulses.
+
+    Its times run evenly even where the board's clock steps (a GPS that gets its fix): a step is kept aside, so that
+    frames can be counted off across it, and ``time_of`` puts it back.
+    """
 
     def __init__(self, rate_hz: float) -> None:
         self.period_ns = round(1e9 / rate_hz)
+        self._report_ns = (
+            self.period_ns // 4
+        )  # what a report takes at most: no frame may seem to come before its trigger
         self._indices: list[int] = []
         self._times_ns: list[int] = []
+        self._untrusted: set[int] = set()
+        self._steps: list[tuple[int, int]] = [(0, 0)]  # from an index on, UTC minus our time
         self._changed = threading.Condition()
 
-    def add(self, pulse: Pulse) -> None:
-        """Book a pulse. One that is not later than the last in index and time (a garbled report) is not believed."""
+    def add(self, pulse: Pulse, trusted: bool = True, step_ns: int = 0) -> bool:
+        """Book a pulse; one that was reported late goes where it belongs.
+
+        Args:
+            pulse: its ``actual_ns`` is the time to be told to others.
+            trusted: False: it is not the board's own, but when its report came.
+            step_ns: what the time has stepped by since the pulse before.
+
+        Returns:
+            False for one that contradicts its neighbours in index or time: it is not believed.
+        """
         with self._changed:
-            if self._indices and (pulse.index <= self._indices[-1] or pulse.actual_ns <= self._times_ns[-1]):
-                return
-            self._indices.append(pulse.index)
-            self._times_ns.append(pulse.actual_ns)
+            if step_ns:
+                self._steps.append((pulse.index, self._steps[-1][1] + step_ns))
+                del self._steps[1:-_STEPS_KEPT]
+            time_ns = pulse.actual_ns - self._offset_ns(pulse.index) - (0 if trusted else self._report_ns)
+            at = bisect.bisect_left(self._indices, pulse.index)
+            if at < len(self._indices) and (self._indices[at] == pulse.index or self._times_ns[at] <= time_ns):
+                return False
+            if at > 0 and self._times_ns[at - 1] >= time_ns:
+                return False
+            self._indices.insert(at, pulse.index)
+            self._times_ns.insert(at, time_ns)
+            if not trusted:
+                self._untrusted.add(pulse.index)
             if len(self._indices) > 2 * _PULSES_KEPT:
                 del self._indices[:_PULSES_KEPT], self._times_ns[:_PULSES_KEPT]
+                self._untrusted = {index for index in self._untrusted if index >= self._indices[0]}
             self._changed.notify_all()
+            return True
 
     def nearest(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
-        """Index and time of the trigger nearest to ``time_ns``.
+        """Index and time of the trigger nearest to ``time_ns``, both in this log's time.
 
         Waits up to ``wait_s`` for the board's report of it. A trigger that was not reported is reckoned from its
         neighbour and the period. None when the board has not reported any pulse.
@@ -67,8 +98,10 @@ class TriggerLog:
                 steps = max(-between, min(between, steps))
             return self._indices[k] + steps, self._times_ns[k] + steps * self.period_ns
 
-    def latest_before(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
-        """Index and time of the last trigger at or before ``time_ns``; None when none is known."""
+    def latest_before(self, utc_ns: int, wait_s: float) -> tuple[int, int] | None:
+        """Index and time, in this log's, of the last trigger at or before a UTC time; None when none is known."""
+        with self._changed:
+            time_ns = utc_ns - self._steps[-1][1]
         found = self.nearest(time_ns, wait_s)
         if found is None or found[1] <= time_ns:
             return found
@@ -79,11 +112,16 @@ class TriggerLog:
             steps = found[0] - 1 - self._indices[before]
             return found[0] - 1, self._times_ns[before] + steps * self.period_ns
 
-    def reported(self, index: int) -> bool:
-        """Whether the board itself has said when it gave this trigger."""
+    def time_of(self, index: int, log_ns: int) -> tuple[int, bool]:
+        """UTC of a trigger whose time in this log is ``log_ns``, and whether the board itself has said it."""
         with self._changed:
             k = bisect.bisect_left(self._indices, index)
-            return k < len(self._indices) and self._indices[k] == index
+            known = k < len(self._indices) and self._indices[k] == index
+            untrusted = index in self._untrusted
+            return log_ns + self._offset_ns(index) + untrusted * self._report_ns, known and not untrusted
+
+    def _offset_ns(self, index: int) -> int:
+        return next(offset_ns for since, offset_ns in reversed(self._steps) if since <= index or since == 0)
 
     def _reported_until(self, time_ns: int) -> bool:
         return bool(self._times_ns) and self._times_ns[-1] > time_ns - self.period_ns // 2
@@ -110,12 +148,14 @@ class TriggerBoard(Worker):
         super().__init__("trigger-board")
         self.port = port
         self.garbled_lines = 0
+        self.boots = 0  # how often the board has said that it was powered up
+        self.gone = ""  # why the port is gone; empty: it is there
         self._clock = clock
         self._on_pulse = on_pulse
         self._on_sample = on_sample
         self._replies: queue.SimpleQueue[tuple[str, ...]] = queue.SimpleQueue()
         try:
-            self._serial = serial.Serial(port, baudrate=115200, timeout=0.1, write_timeout=1.0, exclusive=True)
+            self._serial = self._open()
         except (serial.SerialException, OSError) as error:
             raise TriggerBoardError(
                 f"{port}: the trigger board's port cannot be opened ({error}): check `trigger.port`, the cable, "
@@ -161,17 +201,31 @@ class TriggerBoard(Worker):
         self._serial.close()
 
     def work(self) -> None:
-        """Read lines until asked to stop.
-
-        Raises:
-            TriggerBoardError: the port is gone.
-        """
-        rest = b""
+        """Read lines until asked to stop. A port that goes is opened again as soon as it is back."""
         while not self.stop_requested.is_set():
             try:
-                rest += self._serial.read(self._serial.in_waiting or 1)
+                self._read_lines()
             except (serial.SerialException, OSError) as error:
-                raise TriggerBoardError(f"{self.port}: the trigger board is gone ({error}): check its cable") from error
+                self.gone = f"{self.port}: the trigger board is gone ({error}): check its cable"
+                self._serial.close()
+                self._reopen()
+
+    def _open(self) -> serial.Serial:
+        return serial.Serial(self.port, baudrate=115200, timeout=0.1, write_timeout=1.0, exclusive=True)
+
+    def _reopen(self) -> None:
+        while not self.stop_requested.wait(RECONNECT_S):
+            try:
+                self._serial = self._open()
+            except (serial.SerialException, OSError):
+                continue
+            self.gone = ""
+            return
+
+    def _read_lines(self) -> None:
+        rest = b""
+        while not self.stop_requested.is_set():
+            rest += self._serial.read(self._serial.in_waiting or 1)
             *lines, rest = rest.split(b"\n")
             for line in lines:
                 self._take(line)
@@ -192,6 +246,8 @@ class TriggerBoard(Worker):
                 sample = parse_sample(words)
                 if self._on_sample is not None:
                     self._on_sample(sample)
+            elif words[0] == "BOOT":
+                self.boots += 1
             else:
                 self._replies.put(words)
         except GarbledLine:
@@ -212,6 +268,8 @@ class TriggerBoard(Worker):
     def _ask_once(self, words: tuple[str, ...]) -> tuple[str, ...] | None:
         while not self._replies.empty():  # late answers to questions that were given up
             self._replies.get()
+        if self.gone:
+            raise TriggerBoardError(self.gone)
         try:
             self._serial.write(encode_line(*words))
         except (serial.SerialException, OSError) as error:

@@ -18,6 +18,9 @@ Anything else is answered by ``ERR <code> <words>``. A running board reports eac
 all edges since power-up and is never set back; both times are UTC nanoseconds of the board's PTP clock: when
 the edge was due and when the output register was written.
 
+A board that has been powered up or reset says so once, by itself: ``BOOT <protocol version> <board name>``. It does
+not run, and its counter begins at 0.
+
 A board that samples its inputs, be it running or not, reports each sample, once:
 ``SAMPLE <number> <time_ns> <volts of channel 0> <of channel 1> …``, at most 8 channels, volts with at most 4 decimals.
 ``number`` counts from 0 at each ``ANALOG``; the time is that of the PTP clock.

@@ -218,14 +218,23 @@ def _board_range(report: FlightReport, pulses: dict[int, Trigger], ends: list[di
     """First and one-past-last trigger index by the board's final count, else by its reports."""
     try:
         first, after = int(ends[0]["first_index"]), int(ends[0]["next_index"])
+        counted_from = int(ends[0].get("counted_from", first))
+        resets = int(ends[0].get("board_resets", 0))
         edges = int(ends[0]["counter_end"]) - int(ends[0]["counter_begin"])
         reported = int(ends[0]["triggers_reported"])
     except (IndexError, KeyError, ValueError):
         report.problems.append("no file has the board's final count: the recording was not closed")
         seen = {*pulses, *(index for camera in report.cameras.values() for index in camera.indices)}
         return min(seen, default=0), max(seen, default=-1) + 1
-    if edges != after - first:
-        report.problems.append(f"the board's counter went on by {edges}, its index by {after - first}")
+    if edges != after - counted_from:
+        report.problems.append(
+            f"since trigger {counted_from} the board's counter went on by {edges}, its index by {after - counted_from}"
+        )
+    if resets:
+        report.notes.append(
+            f"the board was reset {resets} times, the last time before trigger {counted_from}: of the triggers before, "
+            "those are counted that it had reported or that frames have shown"
+        )
     if reported != len(pulses):
         report.problems.append(f"{reported} /trigger messages were recorded, {len(pulses)} are in the files")
     if ends[0].get("board_confirmed") != "true":

@@ -6,10 +6,12 @@ the port; lines that nobody reads are lost, as on a wire.
 """
 
 import os
+import queue
 import select
 import threading
 import tty
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +29,25 @@ from capture.trigger_protocol import (
 )
 
 BOARD_NAME = "SimAthena"
+BOOT_NS = 150_000_000
 START_DELAY_NS = 20_000_000
 DELAY_SIGMA_NS = 800.0  # of the output register's write after the due time
 _HIGHEST_MILLIHERTZ = 200_000
 _IDLE_S = 0.2
+
+
+@dataclass
+class LineFaults:
+    """What goes wrong with single pulses, by index. Each happens once: a board that was reset counts anew."""
+
+    unseen: set[int] = field(default_factory=set)  # the edge does not reach the cameras; counted and reported
+    lost: set[int] = field(default_factory=set)  # the report does not come
+    twice: set[int] = field(default_factory=set)
+    garbled: set[int] = field(default_factory=set)
+    late_s: dict[int, float] = field(default_factory=dict)  # the report comes so much later, after others
+    wrong_counter: dict[int, int] = field(default_factory=dict)  # the report's counter is off by
+    wrong_index: dict[int, int] = field(default_factory=dict)
+    strange_clock: dict[int, int] = field(default_factory=dict)  # from this pulse on the board's clock is off by, ns
 
 
 class SimulatedBoard:
@@ -44,6 +61,7 @@ class SimulatedBoard:
         clock: Clock,
         on_pulse: Callable[[Pulse], None],
         volts_at: Callable[[int], tuple[float, ...]] | None = None,
+        faults: LineFaults | None = None,
     ) -> None:
         """Make the pseudo-terminal and put a symbolic link to it at ``port``. ``on_pulse`` is called at each edge.
 
@@ -58,6 +76,11 @@ class SimulatedBoard:
         self._clock = clock
         self._on_pulse = on_pulse
         self._volts_at = volts_at
+        self._faults = faults or LineFaults()
+        self._clock_error_ns = 0
+        self._late: list[tuple[int, bytes]] = []  # due, line
+        self._orders: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._quiet_until_ns = 0  # it is booting
         self._sample_millihertz = self._sampled = self._sample_first_ns = 0
         self._rng = np.random.default_rng([seed, 0x7B])
         self._millihertz = round(rate_hz * 1000)
@@ -67,43 +90,80 @@ class SimulatedBoard:
         self._input = b""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="trigger-board", daemon=True)
-        # Our own hold on the far end: without it the near end breaks whenever the host closes the port.
-        self._board_end, self._host_end = os.openpty()
-        tty.setraw(self._host_end)
-        os.set_blocking(self._board_end, False)
-        try:
-            port.parent.mkdir(parents=True, exist_ok=True)
-            if port.is_symlink():
-                port.unlink()
-            port.symlink_to(os.ttyname(self._host_end))
-        except OSError as error:
-            self._close()
-            raise SimulationError(
-                f"{port}: the trigger port cannot be put there ({error}): give another path"
-            ) from error
+        self._board_end = self._host_end = -1
+        self._plug()
 
     def start(self) -> None:
         """Begin to listen."""
         self._thread.start()
+
+    def reset(self) -> None:
+        """As by its button or a dip of its supply: it forgets everything and boots."""
+        self._orders.put(self._reset)
+
+    def unplug(self) -> None:
+        """Pull its cable out of the computer; it is powered otherwise, and goes on."""
+        self._orders.put(self._unplug)
+
+    def plug(self) -> None:
+        """Put the cable back."""
+        self._orders.put(self._plug)
 
     def close(self) -> None:
         """No pulse after this returns; the port is gone."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(5.0)
-        self.port.unlink(missing_ok=True)
-        self._close()
+        self._unplug()
 
-    def _close(self) -> None:
+    def _plug(self) -> None:
+        # Our own hold on the far end: without it the near end breaks whenever the host closes the port.
+        self._board_end, self._host_end = os.openpty()
+        tty.setraw(self._host_end)
+        os.set_blocking(self._board_end, False)
+        port = self.port
+        try:
+            port.parent.mkdir(parents=True, exist_ok=True)
+            if port.is_symlink():
+                port.unlink()
+            port.symlink_to(os.ttyname(self._host_end))
+        except OSError as error:
+            self._close_ends()
+            raise SimulationError(
+                f"{port}: the trigger port cannot be put there ({error}): give another path"
+            ) from error
+
+    def _unplug(self) -> None:
+        if self._board_end >= 0:
+            self.port.unlink(missing_ok=True)
+            self._close_ends()
+
+    def _close_ends(self) -> None:
         for end in (self._board_end, self._host_end):
             os.close(end)
+        self._board_end = self._host_end = -1
+
+    def _reset(self) -> None:
+        self._running = False
+        self._next_index = self._counter = 0
+        self._sample_millihertz = 0
+        self._input = b""
+        self._late.clear()
+        self._quiet_until_ns = self._clock.utc_ns() + BOOT_NS
 
     def _work(self) -> None:
         try:
             while not self._stop.is_set():
                 wait_s = min([_IDLE_S, *(max((due - self._clock.utc_ns()) * 1e-9, 0.0) for due in self._dues_ns())])
-                if select.select([self._board_end], [], [], wait_s)[0]:
+                if select.select([self._board_end] if self._board_end >= 0 else [], [], [], wait_s)[0]:
                     self._read()
+                while not self._orders.empty():
+                    self._orders.get()()
+                if self._quiet_until_ns and self._clock.utc_ns() >= self._quiet_until_ns:
+                    self._quiet_until_ns = 0
+                    self._send("BOOT", str(PROTOCOL_VERSION), BOARD_NAME)
+                while self._late and self._late[0][0] <= self._clock.utc_ns():
+                    self._write(self._late.pop(0)[1])
                 while self._running and self._clock.utc_ns() >= self._due_ns():
                     self._pulse()
                 while self._sample_millihertz and self._clock.utc_ns() >= self._sample_due_ns():
@@ -113,6 +173,8 @@ class SimulatedBoard:
 
     def _dues_ns(self) -> list[int]:
         dues = [self._due_ns()] if self._running else []
+        dues += [self._quiet_until_ns] if self._quiet_until_ns else []
+        dues += [self._late[0][0]] if self._late else []
         return [*dues, self._sample_due_ns()] if self._sample_millihertz else dues
 
     def _sample_due_ns(self) -> int:
@@ -136,8 +198,34 @@ class SimulatedBoard:
         self._next_index += 1
         self._given += 1
         self._running = self._given != self._count
-        self._send(*pulse.words())  # first: whoever is told of the pulse may keep this program busy
-        self._on_pulse(pulse)
+        self._report(pulse)  # first: whoever is told of the pulse may keep this program busy
+        if pulse.index in self._faults.unseen:
+            self._faults.unseen.remove(pulse.index)
+        else:
+            self._on_pulse(pulse)
+
+    def _report(self, pulse: Pulse) -> None:
+        """Say it, with what goes wrong on the way."""
+        faults, index = self._faults, pulse.index
+        self._clock_error_ns = faults.strange_clock.pop(index, self._clock_error_ns)
+        said = Pulse(
+            index + faults.wrong_index.pop(index, 0),
+            pulse.counter + faults.wrong_counter.pop(index, 0),
+            pulse.commanded_ns + self._clock_error_ns,
+            pulse.actual_ns + self._clock_error_ns,
+        )
+        line = encode_line(*said.words())
+        if index in faults.lost:
+            faults.lost.remove(index)
+        elif index in faults.late_s:
+            self._late.append((self._clock.utc_ns() + round(faults.late_s.pop(index) * 1e9), line))
+            self._late.sort()
+        elif index in faults.garbled:
+            faults.garbled.remove(index)
+            self._write(line.replace(b" ", b"\x00", 1))
+        else:
+            self._write(line * (1 + (index in faults.twice)))
+            faults.twice.discard(index)
 
     def _read(self) -> None:
         try:
@@ -148,7 +236,7 @@ class SimulatedBoard:
         if len(self._input) > MAX_LINE_BYTES:
             self._input = b""
             self._send("ERR", "4", "line", "too", "long")
-        for line in lines:
+        for line in () if self._quiet_until_ns else lines:
             try:
                 self._send(*self._answer(decode_line(line)))
             except GarbledLine:
@@ -188,8 +276,10 @@ class SimulatedBoard:
         return ("ERR", "1", "unknown", "command")
 
     def _send(self, *words: str) -> None:
-        line = encode_line(*words)
+        self._write(encode_line(*words))
+
+    def _write(self, line: bytes) -> None:
         try:
             self.lost_lines += os.write(self._board_end, line) != len(line)
-        except BlockingIOError:
+        except OSError:  # its buffer is full, or the cable is out
             self.lost_lines += 1

@@ -87,6 +87,17 @@ def test_drift_and_noise_are_found():
     assert (figures.outliers, figures.steps) == (0, 0)
 
 
+def test_without_any_report_a_frame_is_as_well_known_as_a_guess():
+    """The board's clock is not on our time: triggers have the time of their report's receipt, up to 1 ms late."""
+    clockwork = Clockwork(walk_ppm=0.1)
+    run = simulate(clockwork, 5000, 9)
+    run.trigger_ns[:] = run.start_ns + np.random.default_rng(1).uniform(0, 1e6, 5000).astype(np.int64)
+    errors, sigmas = follow(ClockFit(clockwork.tick_hz), run, clockwork, np.zeros(5000, dtype=bool))
+    assert abs(errors).max() < 1.5e6
+    assert (sigmas[100:] < 1.5e6).all()
+    assert (abs(errors) < 2 * sigmas).all()
+
+
 def test_wrong_trigger_times_are_not_believed_and_widen_their_frame():
     clockwork = Clockwork()
     run = simulate(clockwork, 1000, 5)
@@ -141,8 +152,8 @@ CAMERA = CameraDescription("fake", "1", 64, 48, 2000, 0.0, 10_000, 1e9, 16, True
 
 
 class AllReported:
-    def reported(self, index: int) -> bool:
-        return True
+    def time_of(self, index: int, log_ns: int) -> tuple[int, bool]:
+        return log_ns, True
 
 
 @pytest.mark.parametrize(
