@@ -8,7 +8,7 @@ import threading
 from collections import deque
 
 from capture.clock import Clock
-from hw_sim.u3v_camera import CONTROL_BYTES, INVALID_ADDRESS, AccessError, Counts, U3vCamera
+from hw_sim.u3v_camera import CONTROL_BYTES, INVALID_ADDRESS, MAKER, MODEL, AccessError, Counts, U3vCamera
 from hw_sim.usbip import Descriptors, Plug, UsbDevice
 
 VENDOR_ID, PRODUCT_ID = 0x1E10, 0x300A
@@ -27,9 +27,11 @@ class U3vPlug(UsbDevice):
 
     def __init__(self, number: int, clock: Clock, buffer_frames: int = 0) -> None:
         self.serial = f"1749{number:04d}"
+        self.guid = f"0A1B{number:08X}"  # as the standard has it: the maker's four digits, then eight of the device
+        self.device_id = f"{MAKER}-{self.guid}-{self.serial}"  # by which hosts tell cameras apart
         self.camera: U3vCamera | None = None  # None: unplugged
         self.counts = Counts()  # since the beginning, over all power-ups
-        self.descriptors = _descriptors(self.serial, number)
+        self.descriptors = _descriptors(self.serial, self.guid)
         self._number = number
         self._clock = clock
         self._buffer_frames = buffer_frames
@@ -112,7 +114,7 @@ class U3vPlug(UsbDevice):
         return self.camera is camera and camera.streaming
 
 
-def _descriptors(serial: str, number: int) -> Descriptors:
+def _descriptors(serial: str, guid: str) -> Descriptors:
     device = struct.pack(
         *("<BBHBBBBHHHBBBB", 18, 1, 0x0300, _MISC, 2, 1, 9, VENDOR_ID, PRODUCT_ID, 0x0100, 1, 2, 3, 1),
     )
@@ -124,8 +126,7 @@ def _descriptors(serial: str, number: int) -> Descriptors:
     configuration = struct.pack("<BBHBBBBB", 9, 2, 9 + len(body), 2, 1, 0, 0x80, 100) + body
     capabilities = struct.pack("<BBBI", 7, 16, 2, 0) + struct.pack("<BBBBHBBH", 10, 16, 3, 0, 0x0E, 3, 10, 100)
     bos = struct.pack("<BBHB", 5, 15, 5 + len(capabilities), 2) + capabilities
-    guid = f"0A1B{number:08X}"  # the standard: vendor's four digits, then eight of the device
-    return Descriptors(device, configuration, bos, ("Point Grey Research", "Flea3 FL3-U3-32S2M", serial, guid))
+    return Descriptors(device, configuration, bos, (MAKER, MODEL, serial, guid))
 
 
 def _endpoint(address: int) -> bytes:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 XML = Path(__file__).with_name("u3v_camera.xml").read_bytes()
+MAKER, MODEL = "Point Grey Research", "Flea3 FL3-U3-32S2M"
 SENSOR_WIDTH, SENSOR_HEIGHT = 2080, 1552
 MONO8, MONO16 = 0x01080001, 0x01100007
 FRAME_BUFFER_BYTES = 32 << 20  # of the camera; what the host does not fetch in time waits in it
@@ -103,6 +104,7 @@ class Counts:
 
     exposed: int = 0
     sent: int = 0
+    lost: int = 0  # as asked for
     overflowed: int = 0  # exposed into a full frame buffer: the frame's id is used up, the frame is gone
 
 
@@ -133,6 +135,7 @@ class U3vCamera:
         self._acquiring = False
         self._latched = 0
         self._cut_short: set[int] = set()
+        self._to_lose: set[int] = set()
         self._held_until = -1
         self._waiting: deque[WireFrame] = deque()
         self._changed = threading.Condition()
@@ -140,6 +143,10 @@ class U3vCamera:
     def cut_short(self, index: int) -> None:
         """Half of this trigger's frame will be missing on the wire."""
         self._cut_short.add(index)
+
+    def lose(self, index: int) -> None:
+        """This trigger's frame will be exposed, and never sent."""
+        self._to_lose.add(index)
 
     def hold_until(self, index: int) -> None:
         """From now on nothing leaves the frame buffer, up to and including the edge of this trigger."""
@@ -236,6 +243,9 @@ class U3vCamera:
             self.counts.exposed += 1
             frame_id = self._frame_id
             self._frame_id += 1
+            if index in self._to_lose:
+                self.counts.lost += 1
+                return
             if len(self._waiting) >= (self._buffer_frames or FRAME_BUFFER_BYTES // size):
                 self.counts.overflowed += 1
                 return
@@ -278,8 +288,8 @@ def _bootstrap(serial: str) -> dict[int, bytearray]:
     """The bootstrap registers after power-up: GenCP's, USB3 Vision's, the stream's, and the manifest."""
     abrm, sbrm, sirm, manifest = bytearray(0x1000), bytearray(0x48), bytearray(0x30), bytearray(8 + 64)
     texts = {
-        0x04: "Point Grey Research",
-        0x44: "Flea3 FL3-U3-32S2M",
+        0x04: MAKER,
+        0x44: MODEL,
         0x84: "Flea3",
         0xC4: "emulated by wingshape",
         0x144: serial,

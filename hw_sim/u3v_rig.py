@@ -4,6 +4,7 @@ A fault is ``<camera>:<what>@<trigger index>``, so that what it must lead to can
 
 ``unplug@i``     the cable is pulled just before trigger i
 ``plug@i``       it is put back just before trigger i
+``lose@i``       trigger i's frame is exposed and never sent
 ``truncate@i``   half of trigger i's frame is missing on the wire
 ``hold@i-j``     the host's controller is not ready from trigger i to j: the camera's frame buffer fills, then overflows
 """
@@ -21,7 +22,7 @@ from capture.trigger_protocol import Pulse
 from hw_sim.trigger_board import SimulatedBoard
 from hw_sim.u3v import U3vPlug
 
-_FAULT = re.compile(r"(\d):(unplug|plug|truncate|hold)@(\d+)(?:-(\d+))?")
+_FAULT = re.compile(r"(\d):(unplug|plug|lose|truncate|hold)@(\d+)(?:-(\d+))?")
 _CLOSE_S = 5.0
 
 
@@ -122,6 +123,8 @@ class U3vRig:
             return
         elif fault.what == "unplug":
             plug.unplug()
+        elif fault.what == "lose":
+            camera.lose(fault.index)
         elif fault.what == "truncate":
             camera.cut_short(fault.index)
         else:

@@ -9,6 +9,7 @@ from capture.errors import ConfigError
 
 BACKENDS: Mapping[str, tuple[str, str]] = {
     "aravis": ("capture.camera.aravis", "AravisCamera"),
+    "v4l2": ("capture.camera.v4l2", "V4l2Camera"),
     "simulated": ("hw_sim.camera", "SimulatedCamera"),
 }
 

@@ -16,8 +16,12 @@ HARNESSES = {
     "simulated": "camera_harness_simulated:SimulatedHarness",
     "aravis-fake": "camera_harness_aravis:AravisFakeHarness",
     "aravis-gige": "camera_harness_aravis:GigeHarness",
+    "usb3": "camera_harness_usb:UsbHarness",
+    "v4l2": "camera_harness_v4l2:VividHarness",
 }
-"""By name: module in tests/support and class. In a virtual machine others are run: WINGSHAPE_HARNESSES=usb3,v4l2."""
+"""By name: module in tests/support and class."""
+IN_THE_VM = ("usb3", "v4l2")
+"""Those that need a kernel of their own: run in the guest of tests/vm, by WINGSHAPE_HARNESSES=usb3,v4l2."""
 
 
 class Harness(ABC):
@@ -74,7 +78,7 @@ class Harness(ABC):
 def wanted_harnesses() -> list[str]:
     """The names that this machine is to run."""
     asked = os.environ.get("WINGSHAPE_HARNESSES")
-    return asked.split(",") if asked else list(HARNESSES)
+    return asked.split(",") if asked else [name for name in HARNESSES if name not in IN_THE_VM]
 
 
 def make_harness(name: str) -> Harness:

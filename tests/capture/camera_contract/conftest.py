@@ -73,6 +73,16 @@ class Bench:
         assert grab is not None, f"no frame within {self.harness.frame_within_s:g} s"
         return grab
 
+    def ids_of(self, count: int) -> list[int]:
+        """The ids of the next frames of a camera that runs free, each buffer given back at once."""
+        ids = []
+        while len(ids) < count:
+            grab = self.camera.grab(self.harness.frame_within_s)
+            assert grab is not None
+            ids.append(grab.frame_id)
+            self.camera.queue(grab.slot, self.pixels(grab.slot))
+        return ids
+
     def grab_until_lost(self) -> None:
         """Grab until the camera is lost, or until it should have been."""
         deadline_s = time.monotonic() + self.harness.loss_within_s

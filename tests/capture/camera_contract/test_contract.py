@@ -2,6 +2,7 @@
 
 import gc
 import itertools
+import re
 import time
 
 import pytest
@@ -122,7 +123,7 @@ def test_a_camera_in_use_is_refused(bench):
     bench.start()
     second = bench.make()
     if bench.harness.exclusive:
-        with pytest.raises(CameraError, match=bench.harness.address.split("#")[-1]):
+        with pytest.raises(CameraError, match=re.escape(bench.harness.address.split("#")[-1])):
             second.open()
     else:
         second.open()
@@ -152,6 +153,10 @@ def test_a_frame_lost_on_its_way_leaves_a_gap(bench):
         return
     first = bench.frame(camera)
     bench.harness.drop()
+    if not camera.hardware_trigger:
+        ids = [first.frame_id, *bench.ids_of(SLOTS)]
+        assert max(b - a for a, b in itertools.pairwise(ids)) > 1
+        return
     bench.expose(camera)
     assert bench.camera.grab(0.5) is None
     following = bench.frame(camera)
