@@ -6,7 +6,7 @@ OUT ?= demo-out
 STAMP := $(VENV)/.installed
 PEERS := $(VENV)/.installed-peers
 
-.PHONY: demo test lint slow docs evidence clean
+.PHONY: demo test test-vm lint slow docs evidence clean
 
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "wingshape needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 ..."; exit 1; }
@@ -29,6 +29,9 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+test-vm: $(STAMP) # drivers and power cuts on a Debian kernel in QEMU
+	$(BIN)/pytest tests/vm
 
 slow: $(PEERS)
 	$(BIN)/pytest -m slow

@@ -19,6 +19,9 @@ MONO8, MONO16 = 0x01080001, 0x01100007
 FRAME_BUFFER_BYTES = 32 << 20  # of the camera; what the host does not fetch in time waits in it
 PATTERN_PERIOD = 251
 CONTROL_BYTES = 1024  # of the largest command and acknowledgement
+RESPONSE_MS = 1000
+"""The longest time to an answer. Aravis gives up a read of the stream after as long, too, and asks again; what arrives
+in between is lost. On a wire that takes microseconds, here milliseconds: frames must not be so far apart."""
 
 ABRM, SBRM, SIRM, MANIFEST, XML_AT, FEATURES = 0x0, 0x10000, 0x20000, 0x30000, 0x40000, 0x100000
 _STREAM_CONTROL, _PAYLOAD_SIZE = 0x4, 0x8
@@ -297,7 +300,7 @@ def _bootstrap(serial: str) -> dict[int, bytearray]:
     for at, text in texts.items():
         abrm[at : at + len(text)] = text.encode()
     struct.pack_into("<I", abrm, 0x00, 0x00010001)  # GenCP 1.1
-    struct.pack_into("<I", abrm, 0x1CC, 200)  # longest response, ms
+    struct.pack_into("<I", abrm, 0x1CC, RESPONSE_MS)
     struct.pack_into("<QQ", abrm, 0x1D0, MANIFEST, SBRM)
     struct.pack_into("<Q", abrm, 0x1FC, 1)  # ns a tick
     struct.pack_into("<I", sbrm, 0x00, 0x00010000)  # USB3 Vision 1.0

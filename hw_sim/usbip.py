@@ -124,8 +124,8 @@ class Plug:
                 if not wanted() or connection is None or self._connection is not connection:
                     return False
                 number, size = asked.popleft()
-            part = data[at : at + size]
-            self._reply(connection, number, 0, len(part), part)
+                part = data[at : at + size]
+                self._reply(connection, number, 0, len(part), part)  # before the host can take its request back
             at += max(len(part), 1)
         return True
 

@@ -23,6 +23,13 @@ from needs import needs_program
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "wingshape"
+START_UDEV = """
+/lib/systemd/systemd-udevd --daemon
+udevadm settle
+echo 1000 > /sys/module/usbcore/parameters/usbfs_memory_mb
+"""
+WINGSIM = "python -c 'from hw_sim.cli import main; main()'"
+WINGCAP = "python -c 'from capture.cli import main; main()'"
 _BOOT_MODULES = ("virtio_pci", "9p", "9pnet_virtio", "overlay")
 _ARTIFACTS = "/artifacts"
 
@@ -149,19 +156,20 @@ class Vm:
         return self._console.read_text(errors="replace") if self._console.exists() else ""
 
 
-def run_in_vm(
-    script: str,
-    artifacts: Path,
-    modules: Sequence[str] = (),
-    drives: Sequence[str] = (),
-    timeout_s: float = 120.0,
-) -> VmRun:
-    """Boot, run ``script`` with ``sh -e`` as root, power off."""
-    vm = Vm(script, artifacts, modules, drives)
+def run_in_vm(script: str, artifacts: Path, modules: Sequence[str] = (), timeout_s: float = 120.0) -> VmRun:
+    """Boot, run ``script`` with ``sh -e`` as root, power off.
+
+    Raises:
+        AssertionError: the script did not come to a good end; the message has all that was said.
+    """
+    vm = Vm(script, artifacts, modules)
     try:
-        return vm.wait(timeout_s)
+        run = vm.wait(timeout_s)
     finally:
         vm.kill()
+    said = f"the guest's script ended with {run.exit_code}:\n{run.output}\n{run.console[-3000:]}"
+    assert run.exit_code == 0, said
+    return run
 
 
 def debian_kernel() -> Kernel:

@@ -1,0 +1,88 @@
+"""USB3 Vision through kernel, udev, libusb and Aravis into a recording, while things happen to the cameras."""
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from capture.record import Frame, decode_image
+from capture.verify import inspect
+
+pytestmark = pytest.mark.slow
+TRIGGERS = 160
+PLACES = ("left/cam0", "left/cam1", "right/cam0", "right/cam1")
+PULLED, CUT_SHORT, HELD, LOSING = PLACES
+
+
+@pytest.fixture(scope="module")
+def report(usb_folders):
+    return inspect(usb_folders)
+
+
+def test_the_recording_is_certified(report, usb_flight):
+    assert report.problems == []
+    assert report.triggers == TRIGGERS
+    assert report.recorded + report.lost == 4 * TRIGGERS
+    assert (report.recorded, report.lost) == (usb_flight[1]["frames_recorded"], usb_flight[1]["frames_lost"])
+
+
+def test_what_was_done_to_the_cameras_is_in_the_books(report):
+    lost = {place: {i: x.stage for i, x in report.cameras[place].lost_indices.items()} for place in PLACES}
+    assert lost[CUT_SHORT] == {20: "usb", 21: "usb"}
+    assert lost[HELD] == {34: "usb", 35: "usb"}  # four waited in the camera's buffer, from 30 on
+    assert lost[LOSING] == {25: "usb"}
+
+
+def test_a_pulled_camera_costs_the_others_nothing_and_comes_back(report, usb_flight):
+    pulled = report.cameras[PULLED]
+    gone = sorted(pulled.lost_indices)
+    assert gone == list(range(40, gone[-1] + 1)), "one gap, from the moment it was pulled"
+    assert 59 <= gone[-1] < TRIGGERS - 20, "it was put back at 60, and has to start"
+    assert {loss.stage for loss in pulled.lost_indices.values()} == {"camera"}
+    absences = usb_flight[1]["absences"]
+    assert list(absences) == [PULLED]
+    assert [absence["end_ns"] > absence["begin_ns"] for absence in absences[PULLED]] == [True]
+
+
+def test_every_frame_shows_the_trigger_it_is_filed_under(usb_folders):
+    """The cameras' pattern holds camera and trigger: also after the one that was pulled has come back."""
+    k = np.arange(208 * 156)
+    seen = 0
+    for path in sorted(path for folder in usb_folders for path in folder.glob("*_*.mcap") if "aux" not in path.name):
+        with path.open("rb") as file:
+            for _, channel, message in make_reader(file).iter_messages():
+                if not channel.topic.endswith("/image_raw"):
+                    continue
+                number = PLACES.index(channel.topic[1:].removesuffix("/image_raw"))
+                expected = (k + 17 * message.sequence + 60 * number) % 251
+                pixels = np.frombuffer(message.data, np.uint8)[decode_image(message.data).pixels_at :]
+                assert np.array_equal(pixels[: expected.size], expected), (path.name, channel.topic, message.sequence)
+                seen += 1
+    assert seen > 3 * TRIGGERS
+
+
+def test_the_cameras_own_counters_are_recorded(usb_folders):
+    """Frame ids count exposures since power-up: the trigger index, and from 0 again after the plug was pulled."""
+    ids: dict[str, dict[int, int]] = {}
+    for path in sorted(path for folder in usb_folders for path in folder.glob("*_*.mcap") if "aux" not in path.name):
+        with path.open("rb") as file:
+            for _, channel, message in make_reader(file).iter_messages():
+                if channel.topic.endswith("/frame"):
+                    frame = Frame.decode(message.data)
+                    place = channel.topic[1:].removesuffix("/frame")
+                    ids.setdefault(place, {})[frame.trigger_index] = frame.device_frame_id
+    for place in (CUT_SHORT, HELD, LOSING):
+        assert all(index == frame_id for index, frame_id in ids[place].items())
+    back = min(index for index in ids[PULLED] if index >= 40)
+    assert all(frame_id == (index if index < 40 else index - back) for index, frame_id in ids[PULLED].items())
+
+
+def test_the_hardware_counts_the_same(usb_flight, report):
+    """What the emulator says it exposed and sent, against what the recorder says it got and lost."""
+    counts = {}
+    for line in (usb_flight[0].artifacts / "rig").read_text().splitlines():
+        serial, _, rest = line.partition(": ")
+        if rest:
+            counts[PLACES[int(serial[-1])]] = {word.split()[1]: int(word.split()[0]) for word in rest.split(", ")}
+    assert counts[LOSING] == {"exposed": TRIGGERS, "sent": TRIGGERS - 1, "lost": 1, "overflowed": 0}
+    assert counts[HELD] == {"exposed": TRIGGERS, "sent": TRIGGERS - 2, "lost": 0, "overflowed": 2}
+    assert counts[PULLED]["sent"] == report.cameras[PULLED].recorded
