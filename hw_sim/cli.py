@@ -145,6 +145,9 @@ def usb_rig(
     ],
     cameras: Annotated[int, typer.Option(min=1, max=4, help="How many cameras to plug in.")] = 4,
     buffer_frames: Annotated[int, typer.Option(min=0, help="Frames a camera can hold back (0: 32 MB of them).")] = 0,
+    response_ms: Annotated[
+        int, typer.Option(min=1, help="The longest time to an answer; also how long Aravis waits for a frame.")
+    ] = 200,
     fault: Annotated[
         list[str] | None,
         typer.Option(
@@ -156,10 +159,11 @@ def usb_rig(
 
     They show a pattern that depends on camera and trigger. A fault is told by camera and trigger index.
     """
+    from hw_sim.u3v_camera import Kind
     from hw_sim.u3v_rig import U3vRig, UsbFault
 
     faults = [UsbFault.parse(text) for text in fault or []]
-    hardware = _be(lambda: U3vRig(cameras, trigger_port, SystemClock(), buffer_frames, faults))
+    hardware = _be(lambda: U3vRig(cameras, trigger_port, SystemClock(), Kind(buffer_frames, response_ms), faults))
     for plugged in hardware.plugs:
         counts = vars(plugged.counts).items()
         note(f"{plugged.serial}: " + ", ".join(f"{count} {what}" for what, count in counts))

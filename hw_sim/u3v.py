@@ -8,7 +8,7 @@ import threading
 from collections import deque
 
 from capture.clock import Clock
-from hw_sim.u3v_camera import CONTROL_BYTES, INVALID_ADDRESS, MAKER, MODEL, AccessError, Counts, U3vCamera
+from hw_sim.u3v_camera import CONTROL_BYTES, INVALID_ADDRESS, MAKER, MODEL, AccessError, Counts, Kind, U3vCamera
 from hw_sim.usbip import Descriptors, Plug, UsbDevice
 
 VENDOR_ID, PRODUCT_ID = 0x1E10, 0x300A
@@ -25,7 +25,7 @@ POWER_UP_DRIFT_PPM = 7  # of camera 1 against camera 0, of camera 2 against came
 class U3vPlug(UsbDevice):
     """A camera that can be plugged in and pulled, any number of times. Each time it powers up afresh."""
 
-    def __init__(self, number: int, clock: Clock, buffer_frames: int = 0) -> None:
+    def __init__(self, number: int, clock: Clock, kind: Kind | None = None) -> None:
         self.serial = f"1749{number:04d}"
         self.guid = f"0A1B{number:08X}"  # as the standard has it: the maker's four digits, then eight of the device
         self.device_id = f"{MAKER}-{self.guid}-{self.serial}"  # by which hosts tell cameras apart
@@ -34,7 +34,7 @@ class U3vPlug(UsbDevice):
         self.descriptors = _descriptors(self.serial, self.guid)
         self._number = number
         self._clock = clock
-        self._buffer_frames = buffer_frames
+        self._kind = kind or Kind()
         self._plug = Plug(self, self.serial)
         self._answers: deque[bytes] = deque()
         self._answered = threading.Condition()
@@ -46,7 +46,7 @@ class U3vPlug(UsbDevice):
             SimulationError: the kernel does not take it.
         """
         drift_ppm = 20 + POWER_UP_DRIFT_PPM * self._number
-        camera = U3vCamera(self._number, self.serial, self._clock.utc_ns(), drift_ppm, self.counts, self._buffer_frames)
+        camera = U3vCamera(self._number, self.serial, self._clock.utc_ns(), drift_ppm, self.counts, self._kind)
         self._answers.clear()
         self._plug.plug_in()
         self.camera = camera

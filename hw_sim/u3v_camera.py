@@ -19,9 +19,10 @@ MONO8, MONO16 = 0x01080001, 0x01100007
 FRAME_BUFFER_BYTES = 32 << 20  # of the camera; what the host does not fetch in time waits in it
 PATTERN_PERIOD = 251
 CONTROL_BYTES = 1024  # of the largest command and acknowledgement
-RESPONSE_MS = 1000
+RESPONSE_MS = 200
 """The longest time to an answer. Aravis gives up a read of the stream after as long, too, and asks again; what arrives
-in between is lost. On a wire that takes microseconds, here milliseconds: frames must not be so far apart."""
+in between is lost. On a wire that takes microseconds, in an emulated kernel milliseconds: frames that come less often
+want a longer time there."""
 
 ABRM, SBRM, SIRM, MANIFEST, XML_AT, FEATURES = 0x0, 0x10000, 0x20000, 0x30000, 0x40000, 0x100000
 _STREAM_CONTROL, _PAYLOAD_SIZE = 0x4, 0x8
@@ -101,6 +102,14 @@ class WireFrame:
     trailer: bytes
 
 
+@dataclass(frozen=True)
+class Kind:
+    """In what cameras of this model may differ."""
+
+    buffer_frames: int = 0  # of its memory; 0: as many as it holds
+    response_ms: int = RESPONSE_MS
+
+
 @dataclass
 class Counts:
     """What became of the trigger edges while the camera was taking frames."""
@@ -124,16 +133,14 @@ class U3vCamera:
     began at ``power_up_ns`` and runs ``drift_ppm`` fast.
     """
 
-    def __init__(
-        self, number: int, serial: str, power_up_ns: int, drift_ppm: int, counts: Counts, buffer_frames: int = 0
-    ) -> None:
+    def __init__(self, number: int, serial: str, power_up_ns: int, drift_ppm: int, counts: Counts, kind: Kind) -> None:
         self.counts = counts
         self._number = number
         self._power_up_ns = power_up_ns
         self._drift_ppm = drift_ppm
-        self._buffer_frames = buffer_frames  # 0: as many as its memory holds
+        self._buffer_frames = kind.buffer_frames
         self._values: dict[str, float] = {name: register.initial for name, register in REGISTERS.items()}
-        self._bootstrap = _bootstrap(serial)
+        self._bootstrap = _bootstrap(serial, kind.response_ms)
         self._frame_id = 0
         self._acquiring = False
         self._latched = 0
@@ -287,7 +294,7 @@ def _number_of(register: Register, value: float) -> float | int:
     return value if register.format == "d" else int(value)
 
 
-def _bootstrap(serial: str) -> dict[int, bytearray]:
+def _bootstrap(serial: str, response_ms: int) -> dict[int, bytearray]:
     """The bootstrap registers after power-up: GenCP's, USB3 Vision's, the stream's, and the manifest."""
     abrm, sbrm, sirm, manifest = bytearray(0x1000), bytearray(0x48), bytearray(0x30), bytearray(8 + 64)
     texts = {
@@ -300,7 +307,7 @@ def _bootstrap(serial: str) -> dict[int, bytearray]:
     for at, text in texts.items():
         abrm[at : at + len(text)] = text.encode()
     struct.pack_into("<I", abrm, 0x00, 0x00010001)  # GenCP 1.1
-    struct.pack_into("<I", abrm, 0x1CC, RESPONSE_MS)
+    struct.pack_into("<I", abrm, 0x1CC, response_ms)
     struct.pack_into("<QQ", abrm, 0x1D0, MANIFEST, SBRM)
     struct.pack_into("<Q", abrm, 0x1FC, 1)  # ns a tick
     struct.pack_into("<I", sbrm, 0x00, 0x00010000)  # USB3 Vision 1.0

@@ -21,6 +21,7 @@ from capture.errors import SimulationError, UsageError
 from capture.trigger_protocol import Pulse
 from hw_sim.trigger_board import SimulatedBoard
 from hw_sim.u3v import U3vPlug
+from hw_sim.u3v_camera import Kind
 
 _FAULT = re.compile(r"(\d):(unplug|plug|lose|truncate|hold)@(\d+)(?:-(\d+))?")
 _CLOSE_S = 5.0
@@ -56,7 +57,7 @@ class U3vRig:
         cameras: int,
         trigger_port: Path,
         clock: Clock,
-        buffer_frames: int = 0,
+        kind: Kind | None = None,
         faults: Sequence[UsbFault] = (),
     ) -> None:
         """The port is there when this returns; nothing is plugged in before ``start``.
@@ -68,7 +69,7 @@ class U3vRig:
         for fault in faults:
             if fault.camera >= cameras:
                 raise UsageError(f"--fault {fault.camera}:{fault.what}: there are only {cameras} cameras, from 0 on")
-        self.plugs = [U3vPlug(number, clock, buffer_frames) for number in range(cameras)]
+        self.plugs = [U3vPlug(number, clock, kind) for number in range(cameras)]
         self.pulses: list[Pulse] = []
         self.error: BaseException | None = None
         self._faults = list(faults)

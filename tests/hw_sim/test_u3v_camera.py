@@ -8,7 +8,7 @@ import pytest
 
 from capture.errors import UsageError
 from hw_sim import u3v_camera
-from hw_sim.u3v_camera import FEATURES, REGISTERS, SIRM, AccessError, Counts, U3vCamera, pattern
+from hw_sim.u3v_camera import FEATURES, REGISTERS, SIRM, AccessError, Counts, Kind, U3vCamera, pattern
 from hw_sim.u3v_rig import UsbFault
 
 NAMESPACE = "{http://www.genicam.org/GenApi/Version_1_1}"
@@ -16,7 +16,7 @@ POWER_UP_NS = 1_000_000_000
 
 
 def camera(buffer_frames: int = 0) -> U3vCamera:
-    return U3vCamera(1, "17490001", POWER_UP_NS, 20, Counts(), buffer_frames)
+    return U3vCamera(1, "17490001", POWER_UP_NS, 20, Counts(), Kind(buffer_frames))
 
 
 def put(device: U3vCamera, name: str, value: float) -> None:

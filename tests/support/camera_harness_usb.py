@@ -10,6 +10,7 @@ from capture.camera.aravis_library import LIBRARY
 from capture.camera.base import CameraSettings
 from capture.clock import SystemClock
 from hw_sim.u3v import U3vPlug
+from hw_sim.u3v_camera import Kind
 
 BUFFER_FRAMES = 4
 _ENUMERATED_S = 20.0
@@ -34,7 +35,7 @@ class UsbHarness(Harness):
     def __enter__(self) -> "UsbHarness":
         needs_library(LIBRARY)
         self._clock = SystemClock()
-        self._device = U3vPlug(0, self._clock, BUFFER_FRAMES)
+        self._device = U3vPlug(0, self._clock, Kind(BUFFER_FRAMES))
         self._index = 0
         self.address = self._device.device_id
         self.settings = CameraSettings(416, 312, 2000, 0.0, shutter_mode="Rolling")

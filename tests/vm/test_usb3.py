@@ -8,7 +8,7 @@ from capture.record import Frame, decode_image
 from capture.verify import inspect
 
 pytestmark = pytest.mark.slow
-TRIGGERS = 160
+TRIGGERS = 100
 PLACES = ("left/cam0", "left/cam1", "right/cam0", "right/cam1")
 PULLED, CUT_SHORT, HELD, LOSING = PLACES
 
@@ -27,16 +27,16 @@ def test_the_recording_is_certified(report, usb_flight):
 
 def test_what_was_done_to_the_cameras_is_in_the_books(report):
     lost = {place: {i: x.stage for i, x in report.cameras[place].lost_indices.items()} for place in PLACES}
-    assert lost[CUT_SHORT] == {20: "usb", 21: "usb"}
+    assert lost[CUT_SHORT] == {8: "usb", 9: "usb"}
     assert lost[HELD] == {34: "usb", 35: "usb"}  # four waited in the camera's buffer, from 30 on
-    assert lost[LOSING] == {25: "usb"}
+    assert lost[LOSING] == {12: "usb"}
 
 
 def test_a_pulled_camera_costs_the_others_nothing_and_comes_back(report, usb_flight):
     pulled = report.cameras[PULLED]
     gone = sorted(pulled.lost_indices)
-    assert gone == list(range(40, gone[-1] + 1)), "one gap, from the moment it was pulled"
-    assert 59 <= gone[-1] < TRIGGERS - 20, "it was put back at 60, and has to start"
+    assert gone == list(range(16, gone[-1] + 1)), "one gap, from the moment it was pulled"
+    assert 23 <= gone[-1] < TRIGGERS - 10, "it was put back at 24, and has to start"
     assert {loss.stage for loss in pulled.lost_indices.values()} == {"camera"}
     absences = usb_flight[1]["absences"]
     assert list(absences) == [PULLED]
@@ -72,8 +72,8 @@ def test_the_cameras_own_counters_are_recorded(usb_folders):
                     ids.setdefault(place, {})[frame.trigger_index] = frame.device_frame_id
     for place in (CUT_SHORT, HELD, LOSING):
         assert all(index == frame_id for index, frame_id in ids[place].items())
-    back = min(index for index in ids[PULLED] if index >= 40)
-    assert all(frame_id == (index if index < 40 else index - back) for index, frame_id in ids[PULLED].items())
+    back = min(index for index in ids[PULLED] if index >= 16)
+    assert all(frame_id == (index if index < 16 else index - back) for index, frame_id in ids[PULLED].items())
 
 
 def test_the_hardware_counts_the_same(usb_flight, report):
