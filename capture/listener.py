@@ -61,6 +61,7 @@ class Listener:
         self._put: Put | None = None
         self._lost: Counter[str] = Counter()  # on links that are closed
         self._link: Link | None = None
+        self._sound = False  # the link has been heard without an error: one that opens may be dead all the same
         self._trouble = "not opened yet"
         self._gone_ns: int | None = None  # since when
         self._heard_s = 0.0
@@ -80,7 +81,7 @@ class Listener:
         rate = (self.messages - then) / max(now_s - then_s, 1e-3)
         lost = self.lost
         values = (("messages", str(self.messages)), ("lost", json.dumps(lost)), ("outages", str(self.outages_in_all)))
-        if self._link is None:
+        if not self._sound:
             return [Diagnostic(2, self.name, self._trouble, values)]
         if now_s - self._heard_s > SILENT_S:
             return [Diagnostic(1, self.name, f"silent for {now_s - self._heard_s:.0f} s", values)]
@@ -110,10 +111,8 @@ class Listener:
     def _listen(self, stop: threading.Event) -> None:
         try:
             while not stop.is_set():
-                if self._link is None and not self._open():
+                if not (self._hear(self._link) if self._link is not None else self._open()):
                     stop.wait(RETRY_S)
-                elif self._link is not None:
-                    self._hear(self._link)
         finally:
             self._book_outage()
             self._close()
@@ -122,29 +121,34 @@ class Listener:
         try:
             self._link = self._connect()
         except LinkError as error:
-            self._trouble = str(error)
-            self._gone_ns = self._gone_ns or self._clock.utc_ns()
+            self._is_gone(str(error))
             return False
         self._heard_s = self._clock.monotonic_s()
-        self._book_outage()
         return True
 
-    def _hear(self, link: Link) -> None:
+    def _hear(self, link: Link) -> bool:
         try:
             heard = link.hear(READ_S)
         except Exception as error:  # drivers raise what they like; whatever it is, the link is opened anew
-            self._trouble = str(error) if isinstance(error, LinkError) else f"{self.name}: {error!r}"
-            self._gone_ns = self._clock.utc_ns()
+            self._is_gone(str(error) if isinstance(error, LinkError) else f"{self.name}: {error!r}")
             self._close()
-            return
+            return False
+        self._sound = True
+        self._book_outage()
         for message in heard:
             put = self._put
             if put is None:
-                return
+                break
             put(message.topic, message.time_ns, message.data)
             self.messages += 1
         if heard:
             self._heard_s = self._clock.monotonic_s()
+        return True
+
+    def _is_gone(self, why: str) -> None:
+        self._sound = False
+        self._trouble = why
+        self._gone_ns = self._gone_ns or self._clock.utc_ns()
 
     def _close(self) -> None:
         link, self._link = self._link, None
