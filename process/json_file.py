@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import platform
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
@@ -65,8 +65,8 @@ def finite_or_none(number: float) -> float | None:
     return float(number) if math.isfinite(number) else None
 
 
-def provenance(command: str, inputs: Iterable[Path]) -> dict[str, Any]:
-    """How a file was made: command line, versions, and the SHA-256 of each input."""
+def provenance(command: str, inputs: Iterable[Path], config: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """How a file was made: command line, versions, the SHA-256 of each input, and what was configured."""
     return {
         "command": command,
         "versions": {
@@ -77,4 +77,5 @@ def provenance(command: str, inputs: Iterable[Path]) -> dict[str, Any]:
             "opencv": cv2.__version__,
         },
         "inputs": {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in inputs},
+        **({"config": dict(config)} if config else {}),
     }

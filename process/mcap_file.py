@@ -5,6 +5,7 @@ here by hopping from record to record, so that indexing never touches a pixel.
 Format: https://mcap.dev/spec (records and opcodes), version 0.
 """
 
+import hashlib
 import os
 import struct
 from collections.abc import Iterator
@@ -54,6 +55,8 @@ class FileIndex:
 
     messages: list[MessageHead] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    fingerprint: str = ""
+    """SHA-256 over place, size and CRC-32 of every chunk: of all its messages, as far as the CRCs tell"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +76,7 @@ def index_file(path: Path) -> FileIndex:
     """Every message of ``path``. A file that ends early is read up to its last complete chunk; nothing is raised."""
     index = FileIndex()
     channels: dict[int, str] = {}
+    content = hashlib.sha256()
     try:
         with _Descriptor(path) as descriptor:
             chunks = _chunks_of_summary(path, channels)
@@ -80,11 +84,14 @@ def index_file(path: Path) -> FileIndex:
                 chunks = _chunks_by_scanning(path, descriptor, channels, index.problems)
             for at, size in chunks:
                 try:
-                    index.messages.extend(_messages_of_chunk(str(path), descriptor, at, size, channels))
+                    head = _chunk_head(os.pread(descriptor, 256, at), size)
+                    content.update(struct.pack("<QQI", at, size, head.crc))
+                    index.messages.extend(_messages_of_chunk(str(path), descriptor, at, size, head, channels))
                 except (BadChunk, McapError) as error:
                     index.problems.append(f"{path}: chunk at byte {at} is not readable ({error})")
     except OSError as error:
         index.problems.append(f"{path}: {error.strerror or error}")
+    index.fingerprint = content.hexdigest()
     return index
 
 
@@ -174,10 +181,9 @@ def _chunks_by_scanning(
 
 
 def _messages_of_chunk(
-    path: str, descriptor: int, at: int, size: int, channels: dict[int, str]
+    path: str, descriptor: int, at: int, size: int, head: _ChunkHead, channels: dict[int, str]
 ) -> Iterator[MessageHead]:
     """Heads of a chunk's messages; channels that it declares are added to ``channels``."""
-    head = _chunk_head(os.pread(descriptor, 256, at), size)
     if head.compression:
         chunk = bytearray(size)
         _read_fully(descriptor, memoryview(chunk), at)

@@ -4,17 +4,14 @@ The work is cut at every 50th trigger of each side, and matching starts afresh a
 depend on how many processes made it.
 """
 
-import os
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 import pyarrow as pa
 
@@ -29,7 +26,7 @@ from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, op
 from process.set_time import marker_instants_ns, ptp_state, set_instant_ns, time_sigma_ns
 from process.tables import MARKER_SCHEMA
 from process.triangulate import triangulate_as
-from process.workers import one_blas_thread
+from process.workers import Shared, crew, usable_cores
 
 BLOCK_TRIGGERS = 50
 BLOCKS_WORTH_A_PROCESS = 4  # starting one costs as much as processing a block or two
@@ -57,12 +54,43 @@ class MarkersResult:
     """blobs turned down in detection, by reason"""
 
 
+@dataclass(frozen=True)
+class Block:
+    """The frame sets of one side that are measured one after the other."""
+
+    side: str
+    number: int
+    places: tuple[SetPlaces, ...]
+
+    @property
+    def name(self) -> str:
+        """Of what it gives."""
+        return f"{self.side}-{self.number:06d}"
+
+
+@dataclass(frozen=True)
+class BlockJob:
+    """A block, and how it is measured."""
+
+    block: Block
+    how: Shared[tuple[Rig, PipelineSettings]]
+
+
+@dataclass(frozen=True, eq=False)
+class BlockResult:
+    """A block's rows of the marker table."""
+
+    table: pa.Table
+    frame_sets: int
+    problems: tuple[str, ...]
+    rejected: dict[str, int]
+
+
 @dataclass
-class _Block:
-    """The rows that one block of triggers gave: a list of arrays a column."""
+class _Rows:
+    """Rows as they come: a list of arrays a column."""
 
     columns: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in MARKER_SCHEMA.names})
-    frame_sets: int = 0
     problems: list[str] = field(default_factory=list)
     rejected: dict[str, int] = field(default_factory=dict)
 
@@ -88,8 +116,7 @@ def markers(
     Raises:
         ProcessError: no recording, or it does not fit the rig (image size).
     """
-    recording = open_recording(flight_paths)
-    return markers_of_recording(recording, rig, settings or PipelineSettings(), progress, workers)
+    return markers_of_recording(open_recording(flight_paths), rig, settings or PipelineSettings(), progress, workers)
 
 
 def markers_of_recording(
@@ -102,131 +129,68 @@ def markers_of_recording(
     """``markers`` of a recording that is open already."""
     check_cameras(recording.files, rig)
     began = time.monotonic()
-    blocks = list(_blocks(recording))
-    total = sum(len(block) for block in blocks)
-    workers = workers or min(os.cpu_count() or 1, len(blocks) // BLOCKS_WORTH_A_PROCESS)
-    whole = _Block()
-    for block in _run(blocks, rig, settings, workers):
-        for name, parts in block.columns.items():
-            whole.columns[name].extend(parts)
-        whole.frame_sets += block.frame_sets
-        whole.problems.extend(block.problems)
-        for reason, count in block.rejected.items():
-            whole.rejected[reason] = whole.rejected.get(reason, 0) + count
-        if progress is not None:
-            progress(whole.frame_sets, total)
-    table = _table(whole)
-    problems = (*recording.problems, *whole.problems)
-    return MarkersResult(table, whole.frame_sets, time.monotonic() - began, problems, whole.rejected)
+    todo = blocks(recording)
+    total = sum(len(block.places) for block in todo)
+    how = Shared((rig, settings))
+    workers = workers or min(usable_cores(), len(todo) // BLOCKS_WORTH_A_PROCESS)
+    found: dict[tuple[str, int], BlockResult] = {}
+    done = 0
+    with crew(workers, modules=(__name__,)) as hands:
+        for number, result in hands.results(measure_block, (BlockJob(block, how) for block in todo)):
+            found[todo[number].side, todo[number].number] = result
+            done += result.frame_sets
+            if progress is not None:
+                progress(done, total)
+    results = [found[key] for key in sorted(found)]
+    rejected: Counter[str] = Counter()
+    for result in results:
+        rejected.update(result.rejected)
+    problems = (*recording.problems, *(problem for result in results for problem in result.problems))
+    table = pa.concat_tables([result.table for result in results])
+    return MarkersResult(table, done, time.monotonic() - began, problems, dict(rejected))
 
 
-def _blocks(recording: Recording) -> Iterator[list[SetPlaces]]:
-    """The recording's frame sets cut at multiples of ``BLOCK_TRIGGERS``, whichever of them are there."""
-    for sets in recording.sides.values():
-        block: list[SetPlaces] = []
-        for places in sets:
-            if block and places.trigger_index // BLOCK_TRIGGERS != block[0].trigger_index // BLOCK_TRIGGERS:
-                yield block
-                block = []
-            block.append(places)
-        yield block
+def blocks(recording: Recording) -> list[Block]:
+    """The recording's frame sets cut at multiples of ``BLOCK_TRIGGERS``, whichever of them are there; sides in turn."""
+    found = []
+    for side, sets in recording.sides.items():
+        for number, members in groupby(sets, lambda places: places.trigger_index // BLOCK_TRIGGERS):
+            found.append(Block(side, number, tuple(members)))
+    return sorted(found, key=lambda block: (block.number, block.side))
 
 
-def _run(blocks: list[list[SetPlaces]], rig: Rig, settings: PipelineSettings, workers: int) -> Iterator[_Block]:
-    """The blocks' results, in order."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield from _run_here_and_there(blocks, rig, settings, workers)
-    finally:
-        cv2.setNumThreads(threads)
-
-
-def _run_here_and_there(
-    blocks: list[list[SetPlaces]], rig: Rig, settings: PipelineSettings, workers: int
-) -> Iterator[_Block]:
-    if workers <= 1:
-        for block in blocks:
-            yield _process_block(block, rig, settings)
-        return
-    with (
-        one_blas_thread(),
-        # spawned, not forked: a forked child inherits locks of the parent's threads
-        ProcessPoolExecutor(workers - 1, get_context("spawn"), _set_up_worker, (rig, settings)) as pool,
-    ):
-        yield from _shared_out(blocks, rig, settings, pool, 2 * (workers - 1))
-
-
-def _shared_out(
-    blocks: list[list[SetPlaces]], rig: Rig, settings: PipelineSettings, pool: ProcessPoolExecutor, ahead: int
-) -> Iterator[_Block]:
-    """The blocks' results, in order; this process works, too, above all while the others are still starting.
-
-    ``ahead`` blocks at most are handed to the pool at a time.
-    """
-    waiting = deque(enumerate(blocks))
-    running: dict[Future[_Block], int] = {}
-    done: dict[int, _Block] = {}
-    for number in range(len(blocks)):
-        while number not in done:
-            while waiting and len(running) < ahead:
-                place, block = waiting.popleft()
-                running[pool.submit(_process_block_of_worker, block)] = place
-            if waiting:
-                place, block = waiting.popleft()
-                done[place] = _process_block(block, rig, settings)
-            else:
-                wait(running, return_when=FIRST_COMPLETED)
-            for future in [future for future in running if future.done()]:
-                done[running.pop(future)] = future.result()
-        yield done.pop(number)
-
-
-_worker: tuple[Rig, PipelineSettings] | None = None
-
-
-def _set_up_worker(rig: Rig, settings: PipelineSettings) -> None:
-    global _worker
-    cv2.setNumThreads(1)
-    _worker = (rig, settings)
-
-
-def _process_block_of_worker(block: list[SetPlaces]) -> _Block:
-    assert _worker is not None
-    return _process_block(block, *_worker)
-
-
-def _process_block(places: list[SetPlaces], rig: Rig, settings: PipelineSettings) -> _Block:
-    block = _Block()
+def measure_block(job: BlockJob) -> BlockResult:
+    """The rows of one block. Raises ProcessError when its images do not fit the rig."""
+    rig, settings = job.how.get()
+    into = _Rows()
     track: Track | None = None
     with FrameSetReader(reuse=True) as reader:
-        for where in places:
+        for where in job.block.places:
             frames = reader.read(where)
-            block.problems.extend(frames.problems)
-            block.frame_sets += 1
+            into.problems.extend(frames.problems)
             if all(moment is None for moment in frames.mid_exposures_ns):
                 continue  # no frame could be read, so there is no time either: it is in the problems
-            track = _process_set(block, frames, rig, settings, track)
-    return block
+            track = _process_set(into, frames, rig, settings, track)
+    return BlockResult(_table(into), len(job.block.places), tuple(into.problems), into.rejected)
 
 
 def _process_set(
-    block: _Block, frames: FrameSet, rig: Rig, settings: PipelineSettings, track: Track | None
+    into: _Rows, frames: FrameSet, rig: Rig, settings: PipelineSettings, track: Track | None
 ) -> Track | None:
     side = rig.side(frames.side)
     _check_size(frames, side)
     if frames.images[0] is None or frames.images[1] is None:
         count = 2 * len(rig.markers.pairs_station_m)
-        _append(block, frames, side, _unseen(count), None, settings, rig.markers)
+        _append(into, frames, side, _unseen(count), None, settings, rig.markers)
         return track
     found = (detect(frames.images[0], settings.detection), detect(frames.images[1], settings.detection))
     for spots in found:
         for rejected in spots.rejected:
             reason = rejected.reason.split(":")[0]
-            block.rejected[reason] = block.rejected.get(reason, 0) + 1
+            into.rejected[reason] = into.rejected.get(reason, 0) + 1
     found = without_lights(side, found)
     matched = match(frames.side, side, rig.markers, found, frames.trigger_index, track, settings.matching)
-    _append(block, frames, side, matched, found, settings, rig.markers)
+    _append(into, frames, side, matched, found, settings, rig.markers)
     return matched.track or track
 
 
@@ -245,7 +209,7 @@ def _unseen(count: int) -> Matches:
 
 
 def _append(
-    block: _Block,
+    into: _Rows,
     frames: FrameSet,
     side: RigSide,
     matched: Matches,
@@ -277,7 +241,7 @@ def _append(
             said = {reason, *found[0].flags[spot0].split(","), *found[1].flags[spot1].split(",")}
             said |= {"ambiguous"} if matched.ambiguous[row] else set()
             flags[row] = ",".join(sorted(said - {""}))
-    columns = block.columns
+    columns = into.columns
     columns["trigger_index"].append(np.full(count, frames.trigger_index, dtype=np.int64))
     columns["side"].append(np.full(count, frames.side))
     columns["marker"].append(np.arange(count, dtype=np.int32))
@@ -296,9 +260,9 @@ def _append(
     columns["flags"].append(np.array(flags, dtype=object))
 
 
-def _table(whole: _Block) -> pa.Table:
+def _table(into: _Rows) -> pa.Table:
     arrays = []
     for member in MARKER_SCHEMA:
-        parts = whole.columns[member.name]
+        parts = into.columns[member.name]
         arrays.append(pa.array(np.concatenate(parts) if parts else [], type=member.type))
     return pa.Table.from_arrays(arrays, schema=MARKER_SCHEMA)

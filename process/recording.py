@@ -51,6 +51,10 @@ class Recording:
     problems: tuple[str, ...]
     """what is missing or unreadable, one line each"""
     files: tuple[Path, ...]
+    fingerprints: dict[str, str] = field(default_factory=dict)
+    """of each file: SHA-256 over the CRCs of its chunks, which reading verifies"""
+    duration_s: float = 0.0
+    """from the first trigger to the last"""
 
     def frame_sets(self, side: str) -> Iterator[FrameSet]:
         """The side's frame sets in trigger order, read from disk as they are asked for."""
@@ -123,11 +127,13 @@ def open_recording(paths: Sequence[Path | str]) -> Recording:
     }
     losses: set[tuple[int, str, str, str]] = set()
     problems: list[str] = []
+    fingerprints: dict[str, str] = {}
     owner = {image_topic(s, CAMERAS[c]): places[s, c].images for s, c in places}
     owner |= {frame_topic(s, CAMERAS[c]): places[s, c].frames for s, c in places}
     for path in files:
         index = index_file(path)
         problems.extend(index.problems)
+        fingerprints[str(path)] = index.fingerprint
         losses |= _losses([head for head in index.messages if head.topic == LOSS_TOPIC])
         for head in index.messages:
             if head.topic in owner:
@@ -141,9 +147,10 @@ def open_recording(paths: Sequence[Path | str]) -> Recording:
     else:
         numbered = _by_stamp(places, problems)
         problems.append("only image topics: triggers numbered by time, exposure unknown, times from the header stamps")
+    times_ns = [head.publish_time_ns for camera in places.values() for head in camera.images]
     sides = _frame_sets(numbered)
     problems.extend(_missing_frames(sides, losses))
-    return Recording(sides, tuple(problems), files)
+    return Recording(sides, tuple(problems), files, fingerprints, (max(times_ns) - min(times_ns)) * 1e-9)
 
 
 def find_files(paths: Sequence[Path | str]) -> tuple[Path, ...]:

@@ -1,17 +1,20 @@
 """Marker and shape tables to Parquet files and back, each with a note of how it was made."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet as pq
 
 from capture.errors import ProcessError
 from process.json_file import provenance
 
 PROVENANCE_KEY = b"wingshape"
+ROW_GROUP_ROWS = 131_072
 
 MARKER_SCHEMA: pa.Schema = pa.schema(
     [
@@ -54,17 +57,77 @@ def write_table(table: pa.Table, path: Path | str, *, command: str, inputs: Iter
     Raises:
         ProcessError: the file cannot be written.
     """
-    path = Path(path)
-    note = json.dumps(provenance(command, inputs)).encode()
-    table = table.replace_schema_metadata({**(table.schema.metadata or {}), PROVENANCE_KEY: note})
-    part = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(table, part, compression="zstd")
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise ProcessError(f"{path}: cannot be written ({error.strerror or error})") from error
+    with TableWriter(Path(path), table.schema, provenance(command, inputs)) as writer:
+        writer.append(table)
+
+
+class TableWriter:
+    """A table to a Parquet file, and the same as CSV beside it, a piece at a time; whole or not at all.
+
+    The files are there when the ``with`` ends without an error.
+
+    Raises:
+        ProcessError: from every method, when a file cannot be written.
+    """
+
+    def __init__(self, path: Path, schema: pa.Schema, note: Mapping[str, Any] | None, *, csv: bool = False) -> None:
+        """``note`` is how it was made, kept in the schema's metadata; None: ``schema`` has it already."""
+        self._path = path
+        self._schema = schema
+        if note is not None:
+            self._schema = schema.with_metadata({**(schema.metadata or {}), PROVENANCE_KEY: json.dumps(note).encode()})
+        self._waiting: list[pa.Table] = []
+        self._rows = 0
+        self._files = [path, path.with_suffix(".csv")] if csv else [path]
+        self._writers: list[Any] = []
+        with self._errors():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._writers.append(pq.ParquetWriter(_part(path), self._schema, compression="zstd"))
+            if csv:
+                self._writers.append(pyarrow.csv.CSVWriter(_part(self._files[1]), schema))
+
+    def append(self, table: pa.Table) -> None:
+        """Write some more rows; the columns are taken by their names."""
+        self._waiting.append(table.select(self._schema.names).cast(self._schema))
+        self._rows += table.num_rows
+        if self._rows >= ROW_GROUP_ROWS:
+            self._flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, failed: type[BaseException] | None, *_: object) -> None:
+        with self._errors():
+            if failed is None:
+                self._flush()
+            for writer in self._writers:
+                writer.close()
+            for path in self._files:
+                if failed is None:
+                    _part(path).replace(path)
+                else:
+                    _part(path).unlink(missing_ok=True)
+
+    def _flush(self) -> None:
+        if self._waiting:
+            table = pa.concat_tables(self._waiting)
+            with self._errors():
+                for writer in self._writers:
+                    writer.write_table(table)
+        self._waiting, self._rows = [], 0
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            for path in self._files:
+                _part(path).unlink(missing_ok=True)
+            raise ProcessError(f"{self._path}: cannot be written ({error.strerror or error})") from error
+
+
+def _part(path: Path) -> Path:
+    return path.with_name(path.name + ".part")
 
 
 def read_table(

@@ -21,8 +21,8 @@ from process.reference import parse_window
 from reconstruct.import_wing import import_wing
 from reconstruct.plan import plan
 from reconstruct.report import write_report
-from reconstruct.result import COMPARISON, REPORT, read_result
-from reconstruct.run import Job, Progress, run_comparison, run_job
+from reconstruct.result import COMPARISON, REPORT, SUMMARY, read_result
+from reconstruct.run import Job, Progress, Step, run_comparison, run_job
 from reconstruct.static import static
 from reconstruct.summary import verdict
 from reconstruct.wing import example_path
@@ -71,7 +71,12 @@ def run_command(
         str | None, typer.Option(help="Count displacements from the mean of these seconds of this recording, A:B.")
     ] = None,
     csv: Annotated[bool, typer.Option(help="Write the tables as CSV too.")] = True,
+    report: Annotated[bool, typer.Option(help="Draw the report; `reconstruct report` can do so later.")] = True,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="Address of a Dask scheduler whose workers are to work, or local: a cluster here."),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Reconstruct a flight: markers (from frames, or a table), shapes, loads, summary and report."""
@@ -82,11 +87,11 @@ def run_command(
     if reference is not None and reference_window is not None:
         raise UsageError("give --reference or --reference-window, not both")
     at_rest = parse_window(reference_window, "--reference-window") if reference_window is not None else reference
-    job = Job(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest)
+    job = Job(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest, report, scheduler)
     with _progress() as progress:
         summary, warnings = run_job(job, progress)
     if json:
-        say_json({**summary, "warnings": list(warnings), "report": str(out / REPORT)})
+        say_json({**summary, "warnings": list(warnings), "report": str(out / REPORT) if report else None})
         return
     for warning in warnings[:SHOWN_WARNINGS]:
         note(f"warning: {warning}")
@@ -97,8 +102,10 @@ def run_command(
     say(f"residual RMS    {summary['residual_rms_mm']:.3f} mm")
     say(f"tip sigma       {summary['sigma_tip_mm']:.2f} mm, {summary['sigma_tip_twist_deg']:.3f} deg (median)")
     say(f"verdict         {' '.join(verdict(summary))}")
-    say(f"time            {summary['wall_s']:.1f} s")
-    say(f"report          {out / REPORT}")
+    say(f"time            {summary['wall_s']:.1f} s{_speed(summary)}, {summary['peak_mb']:.0f} MB")
+    if summary["sets_without_shape"]:
+        say(f"holes           {summary['sets_without_shape']} sets without a shape (see {out / SUMMARY})")
+    say(f"report          {out / REPORT}" if report else f"written         {out}")
 
 
 @app.command("compare")
@@ -190,16 +197,24 @@ def _check_files(files: dict[str, Path | None]) -> None:
             raise UsageError(f"{path}: no such file; give {option} the right one")
 
 
+def _speed(summary: dict[str, Any]) -> str:
+    times = summary["times_real_time"]
+    return "" if times is None else f" ({times:.1f} × real time without start and report)"
+
+
 def _command() -> str:
     return shlex.join(["reconstruct", *sys.argv[1:]])
 
 
 class _Rate(ProgressColumn):
-    """Sets a second, steady."""
+    """Sets a second, and how much faster than they were flown that is."""
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
-        return Text(f"{speed:.0f} sets/s" if speed else "")
+        if not speed:
+            return Text("")
+        flight_s = task.fields["flight_s"]
+        return Text(f"{speed:.0f} sets/s" + (f", {speed * flight_s / task.total:.1f} × real time" if flight_s else ""))
 
 
 @contextmanager
@@ -209,9 +224,9 @@ def _progress() -> Iterator[Progress]:
     with Bar(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
         tasks: dict[str, Any] = {}
 
-        def update(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total)
+        def update(step: Step) -> None:
+            if step.stage not in tasks:
+                tasks[step.stage] = bar.add_task(step.stage, total=step.total, flight_s=step.flight_s)
+            bar.update(tasks[step.stage], completed=step.done)
 
         yield update

@@ -19,6 +19,7 @@ from reconstruct.tables import (
     RESIDUALS,
     SHAPE,
     SIGMA,
+    STIFFNESS_COLUMNS,
     TIP_COLUMNS,
     UNLOADED,
     Floats,
@@ -29,6 +30,12 @@ from reconstruct.tables import (
 
 def result_tables(fits: Mapping[str, SideFits]) -> dict[str, pa.Table]:
     """File name → table, for shape, frames, loads, residuals and the unloaded wing; the left side's rows come first."""
+    parts = [part_tables(fits[side]) for side in sorted(fits)]
+    return {name: pa.concat_tables([part[name] for part in parts]) for name in parts[0]}
+
+
+def part_tables(fits: SideFits) -> dict[str, pa.Table]:
+    """File name → table, of some sets of one wing."""
     makers = {
         SHAPE: shape_table,
         FRAMES: frames_table,
@@ -36,7 +43,7 @@ def result_tables(fits: Mapping[str, SideFits]) -> dict[str, pa.Table]:
         RESIDUALS: residuals_table,
         UNLOADED: unloaded_table,
     }
-    return {name: pa.concat_tables([make(fits[side]) for side in sorted(fits)]) for name, make in makers.items()}
+    return {name: make(fits) for name, make in makers.items()}
 
 
 def shape_table(fits: SideFits) -> pa.Table:
@@ -57,6 +64,8 @@ def shape_table(fits: SideFits) -> pa.Table:
             "sigma_twisted_deg": np.degrees(fits.sigma_twisted_rad).ravel(),
             **_flat(CURVATURE, fits.curvature_1pm),
             **_flat([f"sigma_{name}" for name in CURVATURE], fits.sigma_curvature_1pm),
+            "extension": fits.extension.ravel(),
+            "sigma_extension": fits.sigma_extension.ravel(),
             "flags": _text(np.repeat(fits.flags, fits.s_m.size)),
         }
     )
@@ -79,6 +88,9 @@ def frames_table(fits: SideFits) -> pa.Table:
             **_flat([f"sigma_{name}" for name in NET_COLUMNS], fits.sigma_net),
             "residual_rms_mm": 1e3 * rms(residual, axis=1),
             "chi2_per_dof": fits.chi2 / fits.dof,
+            "dof": fits.dof,
+            **_flat(STIFFNESS_COLUMNS, fits.stiffness_change),
+            **_flat([f"sigma_{name}" for name in STIFFNESS_COLUMNS], fits.sigma_stiffness),
             "markers_used": fits.used.sum(axis=1).astype(np.int32),
             "iterations": fits.iterations.astype(np.int32),
             "flags": _text(fits.flags),

@@ -1,8 +1,9 @@
-"""A flight, or its marker table, and a wing file → a whole result folder: tables, CSV, summary, figures and report."""
+"""A flight, or its marker table, and a wing file → a whole result folder: tables, summary, figures and report."""
 
-import shutil
+import contextlib
+import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -13,25 +14,47 @@ import pyarrow as pa
 
 from capture.errors import ReconstructError, UsageError
 from process.camera_model import Rig
+from process.flight_cameras import check_cameras
 from process.json_file import provenance, write_json
-from process.pipeline import markers as measure_markers
+from process.memory import MemoryWatch
+from process.parts import PartStore
+from process.pipeline import PipelineSettings
+from process.recording import Recording, find_files, open_recording
 from process.shared_error import with_rig
-from process.tables import write_table
+from process.tables import MARKER_SCHEMA, write_table
+from process.workers import Crew, crew, usable_cores
+from reconstruct.assemble import Target, assemble
 from reconstruct.compare import Comparison, compare
 from reconstruct.identify import identify
 from reconstruct.iteration import FEWEST_MARKERS
 from reconstruct.reference import Reference
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_result
-from reconstruct.result_tables import result_tables
-from reconstruct.series import SideFits, fit_series
-from reconstruct.shared import shared_errors
-from reconstruct.summary import summarise
-from reconstruct.tables import MARKERS, UNLOADED, marker_series, read_table, write_csv
+from reconstruct.series import half_of, measured_markers
+from reconstruct.shared import SharedError, shared_errors
+from reconstruct.stages import FitPlan, Key, fit, measure, sampled, take
+from reconstruct.summary import holes, summarise
+from reconstruct.tables import FRAMES, LOADS, MARKERS, RESIDUALS, SHAPE, SIDES, MarkerSeries, read_table
 from reconstruct.wing import Wing, read_wing
 
-Progress = Callable[[str, int, int], None]
-"""told the stage, what is done of it, and how much there is"""
+PARTS = ".parts"
+MODULES = ("reconstruct.stages",)  # what a worker loads before the clock starts
+BYTES_A_SECOND = 500e6  # of frames that one core works off, roughly,
+ROWS_A_SECOND = 6000.0  # and of markers
+WORTH_A_WORKER_S = 1.5  # starting one takes a second
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far a run has got."""
+
+    stage: str
+    done: int  # sets
+    total: int
+    flight_s: float  # what they are in all, of flight
+
+
+Progress = Callable[[Step], None]
 
 
 @dataclass(frozen=True)
@@ -43,65 +66,84 @@ class Job:
     markers: Path | None
     wing: Path
     out: Path
-    csv: bool
-    workers: int | None  # None: one a core
-    command: str  # as it is recorded in the files
+    csv: bool = True
+    workers: int | None = None  # None: one a core
+    command: str = ""  # as it is recorded in the files
     smooth_s: float = 0.0  # correlation time of smoothing; 0: every set by itself
     reference: Reference = None  # what displacements are counted from; None: the unloaded wing
+    report: bool = True
+    scheduler: str | None = None  # a Dask scheduler's address, or local; None: processes of our own
+    settings: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
 
 
-def run_job(job: Job, progress: Progress) -> tuple[dict[str, Any], tuple[str, ...]]:
+@dataclass
+class _Clock:
+    """When a run got where, seconds."""
+
+    began: float
+    first_byte: float = 0.0
+    measured: float = 0.0
+    fitted: float = 0.0
+    written: float = 0.0
+
+
+def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Do ``job``; returns the summary as written, and warnings on the recording.
 
-    Files of an earlier run in the same folder are replaced, its comparison is removed. Raises UsageError when an input
-    is missing or cannot be used, ReconstructError when no set could be fitted (the tables, which say why, are written).
+    Files of an earlier run in the same folder are replaced, its comparison is removed. What a run that was killed had
+    got done is taken up. Raises UsageError when an input is missing or cannot be used, ReconstructError when no set
+    could be fitted (the tables, which say why, are written), ProcessError when a worker died or a disk refused.
     """
-    began = time.monotonic()
+    clock = _Clock(time.monotonic())
     wing = read_wing(job.wing)
-    table, source, inputs, warnings = _measure(job, progress)
-    series = marker_series(table, source)
-    measured = time.monotonic()
-    total, done = sum(one.trigger_index.size for one in series.values()), 0
-
-    def fitted(count: int) -> None:
-        nonlocal done
-        done += count
-        progress("fit", done, total)
-
-    fits = fit_series(
-        series,
-        wing,
-        shared=shared_errors(table),
-        reference=job.reference,
-        smooth_s=job.smooth_s,
-        workers=job.workers,
-        progress=fitted,
-    )
-    fit_end = time.monotonic()
-    _write_tables(job, table, fits, inputs)
-    written = time.monotonic()
-    how = provenance(job.command, inputs)
+    source = _Source(job)
+    plan = FitPlan(wing, job.smooth_s, source.shared, job.reference)
+    plan.of(SIDES[0])  # what cannot be fitted is refused before frames are measured
+    with MemoryWatch() as memory, crew(_workers(job, source), job.scheduler, MODULES) as hands:
+        clock.first_byte = time.monotonic()
+        source.open()
+        note = source.note(plan)
+        store = PartStore(job.out / PARTS, {key: value for key, value in note.items() if key != "command"})
+        resumed = len(store) > 0
+        try:
+            measured = source.measure(store, hands, progress)
+            clock.measured = time.monotonic()
+            fitted = fit(measured, plan, store, hands, _telling(progress, "fit", source.flight_s), source.name)
+            clock.fitted = time.monotonic()
+        except UsageError:  # nothing that another run could go on with
+            store.remove()
+            with contextlib.suppress(OSError):
+                job.out.rmdir()
+            raise
+        _remove_stale(job)
+        found = assemble(store, measured, fitted, Target(job.out, job.csv, note, source.rig))
+        clock.written = time.monotonic()
     summary = {
         "version": version("wingshape"),
         "wing": wing.name,
-        **summarise(fits),
-        "warnings": _warnings(wing, fits),
-        "timing_s": {"markers": measured - began, "fit": fit_end - measured, "tables": written - fit_end},
-        "wall_s": written - began,
-        "command": how["command"],
-        "inputs": how["inputs"],
+        **summarise(found.tallies, found.frames),
+        "reference": found.reference,
+        "smoothed_s": job.smooth_s,
+        "warnings": _warnings(wing, sampled(fitted, wing, store, source.name)),
+        **holes(found.frames),
+        **_timing(clock, found.frames, resumed),
+        "peak_mb": memory.peak_bytes / 1e6,
+        **note,
         "flights": [str(path) for path in job.flights],
     }
+    problems = (*source.problems, *(line for key in measured for line in store.read(key.markers).note["problems"]))
     write_json(job.out / SUMMARY, summary)
-    if not any(side.converged.any() for side in fits.values()):
-        reason = next(iter(fits.values())).reason[0]
-        raise ReconstructError(f"{source}: no set could be fitted ({reason}); see {job.out / 'frames.parquet'}")
-    write_report(read_result(job.out), job.out)
-    end = time.monotonic()
-    summary["timing_s"]["report"] = end - written
-    summary["wall_s"] = end - began
-    write_json(job.out / SUMMARY, summary)
-    return summary, warnings
+    if not summary["converged_percent"]:
+        reason = found.frames.column("reason")[0].as_py()
+        raise ReconstructError(f"{source.name}: no set could be fitted ({reason}); see {job.out / FRAMES}")
+    if job.report:
+        write_report(read_result(job.out), job.out)
+        end = time.monotonic()
+        summary["timing_s"]["report"] = end - clock.written
+        summary["wall_s"] = end - clock.began
+        write_json(job.out / SUMMARY, summary)
+    store.remove()
+    return summary, problems
 
 
 def run_comparison(result: Path, reference: Path, folder: Path, command: str) -> Comparison:
@@ -118,46 +160,108 @@ def run_comparison(result: Path, reference: Path, folder: Path, command: str) ->
     return comparison
 
 
-def _measure(job: Job, progress: Progress) -> tuple[pa.Table, str, list[Path], tuple[str, ...]]:
-    """The marker table, its name for messages, the input files, and warnings."""
-    if job.markers is not None:
-        return read_table(job.markers, ()), str(job.markers), [job.wing, job.markers], ()
-    if job.rig is None:
-        raise UsageError("frames need --rig rig.json (a marker table does not: give it with --markers)")
-    rig = Rig.read(job.rig)
-    found = measure_markers(
-        job.flights, rig, progress=lambda done, total: progress("markers", done, total), workers=job.workers
-    )
-    return with_rig(found.table, rig), " ".join(str(path) for path in job.flights), [job.wing, job.rig], found.problems
+class _Source:
+    """Where a job's markers come from: a recording and its rig, or a marker table."""
+
+    def __init__(self, job: Job) -> None:
+        """Raises UsageError when flights come without a rig, ProcessError when there is no recording."""
+        self.problems: tuple[str, ...] = ()
+        self.flight_s = 0.0
+        self.rig: Rig | None = None
+        self.shared: dict[str, SharedError]
+        self._job = job
+        self._recording: Recording | None = None
+        self._table: pa.Table | None = None
+        if job.markers is not None:
+            self._table = read_table(job.markers, ())
+            self.name = str(job.markers)
+            self.shared = shared_errors(self._table)
+            self.work_s = self._table.num_rows / ROWS_A_SECOND
+            return
+        if job.rig is None:
+            raise UsageError("frames need --rig rig.json (a marker table does not: give it with --markers)")
+        self.rig = Rig.read(job.rig)
+        self.shared = shared_errors(with_rig(MARKER_SCHEMA.empty_table(), self.rig))
+        self.name = " ".join(str(path) for path in job.flights)
+        self.work_s = sum(path.stat().st_size for path in find_files(job.flights)) / BYTES_A_SECOND
+
+    def open(self) -> None:
+        """Index the recording."""
+        if self._table is None:
+            assert self.rig is not None
+            self._recording = open_recording(self._job.flights)
+            check_cameras(self._recording.files, self.rig)
+            self.problems = self._recording.problems
+            self.flight_s = self._recording.duration_s
+
+    def note(self, plan: FitPlan) -> dict[str, Any]:
+        """How a result of it is made: all that the result depends on."""
+        job = self._job
+        inputs = [path for path in (job.wing, job.rig, job.markers, _reference_file(job)) if path is not None]
+        config = {
+            "measuring": dataclasses.asdict(job.settings),
+            "instants": dataclasses.asdict(plan.instants),
+            "smooth_s": plan.smooth_s,
+            "reference": None if plan.reference is None else str(plan.reference),
+        }
+        recording = {} if self._recording is None else self._recording.fingerprints
+        return {**provenance(job.command, inputs, config), "recording": recording}
+
+    def measure(self, store: PartStore, hands: Crew, progress: Progress) -> list[Key]:
+        """The keys of the blocks that there are, measured."""
+        if self._recording is None or self.rig is None:
+            return take(self._table, self.name, store)
+        tell = _telling(progress, "markers", self.flight_s)
+        return measure(self._recording, self.rig, self._job.settings, store, hands, tell)
 
 
-def _warnings(wing: Wing, fits: dict[str, SideFits]) -> list[str]:
+def _workers(job: Job, source: _Source) -> int:
+    return job.workers or max(1, min(usable_cores(), int(source.work_s / WORTH_A_WORKER_S)))
+
+
+def _telling(progress: Progress, stage: str, flight_s: float) -> Callable[[int, int], None]:
+    return lambda done, total: progress(Step(stage, done, total, flight_s))
+
+
+def _remove_stale(job: Job) -> None:
+    """A run that fails half way must not leave an older one's words."""
+    texts = [Path(name).with_suffix(".csv").name for name in (SHAPE, FRAMES, LOADS, RESIDUALS, MARKERS)]
+    for stale in (REPORT, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
+        (job.out / stale).unlink(missing_ok=True)
+
+
+def _reference_file(job: Job) -> Path | None:
+    if not isinstance(job.reference, Path):
+        return None
+    return job.reference / SHAPE if job.reference.is_dir() else job.reference
+
+
+def _warnings(wing: Wing, sample: Mapping[str, MarkerSeries]) -> list[str]:
     """What the wing's markers, with the noise they had, cannot tell."""
     said: dict[str, None] = {}
-    for side, own in fits.items():
-        known = np.asarray(np.isfinite(own.markers.cov_m2).all(axis=(-1, -2)))
-        cov = np.full(own.markers.cov_m2.shape[1:], np.nan)
+    for side, series in sample.items():
+        known = measured_markers(series)
+        cov = np.full(series.cov_m2.shape[1:], np.nan)
         for marker in range(known.shape[1]):
             if known[:, marker].any():
-                cov[marker] = np.median(own.markers.cov_m2[:, marker][known[:, marker]], axis=0)
+                cov[marker] = np.median(series.cov_m2[:, marker][known[:, marker]], axis=0)
         if np.isfinite(cov[:, 0, 0]).sum() >= FEWEST_MARKERS:
-            said.update(dict.fromkeys(identify(wing.half(side), wing.fit, cov).warnings))  # type: ignore[arg-type]
+            said.update(dict.fromkeys(identify(half_of(wing, side), wing.fit, cov).warnings))
     return list(said)
 
 
-def _write_tables(job: Job, table: pa.Table, fits: dict[str, SideFits], inputs: Sequence[Path]) -> None:
-    job.out.mkdir(parents=True, exist_ok=True)
-    tables = result_tables(fits)
-    texts = [Path(name).with_suffix(".csv").name for name in (*tables, MARKERS)]
-    for stale in (REPORT, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
-        (job.out / stale).unlink(missing_ok=True)  # a run that fails half way must not leave an older one's words
-    for name, content in tables.items():
-        write_table(content, job.out / name, command=job.command, inputs=inputs)
-    if job.markers is None:
-        write_table(table, job.out / MARKERS, command=job.command, inputs=inputs)
-    elif job.markers.resolve() != (job.out / MARKERS).resolve():
-        shutil.copyfile(job.markers, job.out / MARKERS)  # keeps its own note of how it was made
-    if job.csv:
-        for name, content in {**tables, MARKERS: table}.items():
-            if name != UNLOADED:
-                write_csv(content, (job.out / name).with_suffix(".csv"))
+def _timing(clock: _Clock, frames: pa.Table, resumed: bool) -> dict[str, Any]:
+    """``flight_s`` over the time from the first byte read to the last row written is ``times_real_time``."""
+    times = frames.column("timestamp_ns").to_numpy()
+    flight_s = float(times.max() - times.min()) * 1e-9
+    return {
+        "timing_s": {
+            "start": clock.first_byte - clock.began,
+            "markers": clock.measured - clock.first_byte,
+            "fit": clock.fitted - clock.measured,
+            "tables": clock.written - clock.fitted,
+        },
+        "wall_s": clock.written - clock.began,
+        "flight_s": flight_s,
+        "times_real_time": None if resumed else flight_s / (clock.written - clock.first_byte),
+    }

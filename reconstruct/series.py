@@ -1,22 +1,20 @@
 """A flight's marker table → the fitted shape of both half wings at every trigger."""
 
-import itertools
-import multiprocessing
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from capture.errors import ReconstructError, UsageError
+from capture.errors import UsageError
+from process.pipeline import BLOCK_TRIGGERS
 from process.reference import Window
-from process.workers import one_blas_thread
+from process.workers import Shared, crew, usable_cores
 from reconstruct.fit import Fit, common_scale, fit_frame
-from reconstruct.instants import InstantMarkers, InstantSettings, at_common_instant
+from reconstruct.instants import InstantSettings, at_common_instant
+from reconstruct.iteration import FEWEST_MARKERS
 from reconstruct.reference import Reference, ReferenceShape, mean_of, recorded, unloaded
 from reconstruct.shared import SharedError, shared_errors, sigma_of
 from reconstruct.smooth import smooth_fits
@@ -26,7 +24,11 @@ from reconstruct.wing_file import FitSettings
 
 _Rows = dict[str, Any]  # field of SideFits → array over a block's sets
 
-BLOCK_SETS = 20  # sets fitted one after the other with warm starts; fixed, so that workers do not change results
+NOTHING_MEASURED = "no marker was measured in any set; look at the flags column of the marker table"
+SCALE_SETS = 60  # of a flight, to choose the prior's scale from
+CORRELATION_TIMES = 4.0  # of a stretch's surroundings that smoothing takes into account
+MARGIN_S = 0.05  # markers of a set are at most this far from its instant
+SETS_AT_ONCE = 10  # whose answers to shared errors are in memory
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ class SideFits:
     sigma_twisted_rad: Floats  # (F, N + 1) of the twist against the reference
     curvature_1pm: Floats  # (F, N + 1, 3) elastic: twist, out-of-plane, in-plane; mean of the elements at a node
     sigma_curvature_1pm: Floats  # (F, N + 1, 3)
+    extension: Floats  # (F, N + 1) elastic strain along the axis, mean of the elements at a node
+    sigma_extension: Floats  # (F, N + 1)
     stiffness_change: Floats  # (F, 4) relative, as found; zero where loads act everywhere
     sigma_stiffness: Floats  # (F, 4)
     markers: MarkerSeries  # what was fitted: the wing's M markers in its order
@@ -75,27 +79,49 @@ class SideFits:
         return np.asarray(np.isfinite(self.xyz_m).all(axis=(1, 2)))
 
 
+_OF_THE_WING = {"side", "s_m", "unloaded_xyz_m", "reference", "reference_xyz_m", "reference_twist_rad"}
+_OF_THE_WING |= {"markers", "load_s_m", "smoothed_s"}
+
+
 @dataclass(frozen=True, eq=False)
-class _Side:
-    """One side, ready to be fitted."""
+class FitHow:
+    """How the sets of one wing are fitted."""
 
     half: HalfWing
     settings: FitSettings
-    series: MarkerSeries
-    moved: InstantMarkers
-    prior_scale: Floats | None
-    shared: SharedError | None
+    instants: InstantSettings = field(default_factory=InstantSettings)
+    smooth_s: float = 0.0
+    """correlation time; 0: every set by itself"""
+    shared: SharedError | None = None
+    """that all frames share; None: not known, sigmas hold noise only"""
+    prior_scale: Floats | None = None
+    """of the prior's groups; None: each set chooses its own"""
+    reference: ReferenceShape | None = None
+    """what displacements are counted from; None: the unloaded wing"""
+
+    @property
+    def around_s(self) -> float:
+        """How far in time from a set others have a say in its fit."""
+        return max(self.instants.reach_s + MARGIN_S, CORRELATION_TIMES * self.smooth_s)
 
 
 @dataclass(frozen=True, eq=False)
-class _Block:
-    side: str
-    first: int
-    xyz_m: Floats
-    cov_m2: Floats
-    prior_scale: Floats | None
-    shared: SharedError | None
-    reference: ReferenceShape
+class Stretch:
+    """Consecutive sets of one wing that are fitted from one another, and those around them."""
+
+    markers: MarkerSeries
+    first: int  # the stretch is markers[first:last],
+    last: int  # the others are within FitHow.around_s
+
+
+@dataclass(frozen=True, eq=False)
+class FitJob:
+    """A stretch to be fitted."""
+
+    stretch: Stretch
+    how: Shared[FitHow]
+    window_ns: tuple[int, int] = (0, 0)
+    """for ``window_fits``"""
 
 
 def fit_series(
@@ -111,50 +137,160 @@ def fit_series(
 ) -> dict[str, SideFits]:
     """Fit every set of both sides; ``progress`` is told the number of sets fitted since it was last called.
 
-    Markers are first brought to their set's common instant. Sets are fitted in blocks of BLOCK_SETS, each from the
-    last one's fit; blocks start from the unloaded wing, so the result does not depend on ``workers`` (default: one a
-    core this process may use). A set that cannot be fitted is NaN and flagged. With ``smooth_s`` the sets of a side are
-    smoothed in time over so many seconds instead, one after the other, and sets that could not be fitted are bridged.
+    Markers are first brought to their set's common instant. Each set's fit starts from the last one's, and afresh from
+    the unloaded wing at every trigger index that is a multiple of BLOCK_TRIGGERS, so that the result does not depend on
+    ``workers`` (default: one a core this process may use). A set that cannot be fitted is NaN and flagged. With
+    ``smooth_s`` the sets are smoothed in time over so many seconds, and sets that could not be fitted are bridged.
     ``shared`` are the errors that all frames share, by side; without, sigmas hold noise only. Displacements are counted
     from ``reference``.
 
     Raises:
         UsageError: the markers are not those of ``wing``, or none was measured, or ``reference`` does not fit them.
-        ReconstructError: a worker process died.
+        ProcessError: a worker process died.
     """
-    sides = {
-        side: _side(wing, _as_in(_half(wing, side), series), instants, (shared or {}).get(side))
-        for side, series in markers.items()
-    }
-    if not any(own.moved.points.any() for own in sides.values()):
-        raise UsageError("no marker was measured in any set; look at the flags column of the marker table")
-    start_ns = min(int(own.series.frame_timestamp_ns.min()) for own in sides.values())
-    if smooth_s > 0:
-        return {side: _smoothed(own, reference, start_ns, smooth_s, progress) for side, own in sides.items()}
-    references = {side: _reference(own, reference, start_ns) for side, own in sides.items()}
-    blocks = [block for side, own in sides.items() for block in _blocks(own, references[side])]
-    done: dict[str, dict[int, _Rows]] = {side: {} for side in sides}
-    for block, rows in _fit_blocks(blocks, wing, workers or len(os.sched_getaffinity(0))):
-        done[block.side][block.first] = rows
-        if progress is not None:
-            progress(len(block.xyz_m))
-    return {
-        side: _gather(own, references[side], [done[side][first] for first in sorted(done[side])])
-        for side, own in sides.items()
-    }
+    given = instants or InstantSettings()
+    whole = {side: as_in(half_of(wing, side), series) for side, series in markers.items()}
+    if not any(measured_markers(series).any() for series in whole.values()):
+        raise UsageError(NOTHING_MEASURED)
+    start_ns = min(int(series.frame_timestamp_ns.min()) for series in whole.values())
+    jobs = []
+    for side, series in whole.items():
+        how = fit_how(wing, side, given, smooth_s, (shared or {}).get(side))
+        picked = np.flatnonzero(enough_markers(series))
+        picked = picked[picks(picked.size)]
+        moved = at_common_instant(series, how.instants)
+        how = replace(how, prior_scale=prior_scale(how, moved.xyz_m[picked], moved.cov_m2[picked]))
+        cut = stretches(series, how.around_s)
+        alone = Shared(how)
+        window = window_ns(reference, start_ns)
+        fits = [
+            fit for one in cut if window and touches(one, window) for fit in window_fits(FitJob(one, alone, window))
+        ]
+        common = Shared(replace(how, reference=reference_shape(how, side, reference, fits)))
+        jobs += [FitJob(stretch, common) for stretch in cut]
+    done: dict[int, SideFits] = {}
+    with crew(min(workers or usable_cores(), len(jobs)), modules=(__name__,)) as hands:
+        for number, found in hands.results(fit_stretch, jobs):
+            done[number] = found
+            if progress is not None:
+                progress(found.trigger_index.size)
+    parts = [done[number] for number in sorted(done)]
+    return {side: joined([part for part in parts if part.side == side]) for side in markers}
 
 
-def _half(wing: Wing, side: str) -> HalfWing:
+def fit_how(wing: Wing, side: str, instants: InstantSettings, smooth_s: float, shared: SharedError | None) -> FitHow:
+    """How the sets of one side are fitted, but for the prior's scale and the reference.
+
+    Raises UsageError when the wing file does not say where loads act, or smoothing asks for loads elsewhere.
+    """
+    if wing.fit is None:
+        raise UsageError(f"the wing {wing.name!r} has no [fit] section: say where its loads act (load_stations_m)")
+    if smooth_s > 0 and wing.fit.loads != "everywhere":
+        raise UsageError('smoothing in time needs loads = "everywhere" in the wing file\'s [fit]')
+    return FitHow(half_of(wing, side), wing.fit, instants, smooth_s, shared)
+
+
+def stretches(series: MarkerSeries, around_s: float) -> list[Stretch]:
+    """``series`` cut at every trigger index that is a multiple of BLOCK_TRIGGERS, each with the sets around it."""
+    blocks = series.trigger_index // BLOCK_TRIGGERS
+    cuts = [0, *(np.flatnonzero(np.diff(blocks)) + 1).tolist(), series.trigger_index.size]
+    return [stretch_of(series, first, last, around_s) for first, last in pairwise(cuts)]
+
+
+def stretch_of(series: MarkerSeries, first: int, last: int, around_s: float) -> Stretch:
+    """The sets [first, last) of ``series``, with those that are within ``around_s`` of its ends without a break."""
+    times_ns, reach = series.frame_timestamp_ns, around_s * 1e9
+    before = np.abs(times_ns[:first] - times_ns[first]) > reach
+    after = np.abs(times_ns[last:] - times_ns[last - 1]) > reach
+    begin = int(np.flatnonzero(before)[-1]) + 1 if before.any() else 0
+    end = last + int(np.argmax(after)) if after.any() else times_ns.size
+    return Stretch(series[begin:end], first - begin, last - begin)
+
+
+def fit_stretch(job: FitJob) -> SideFits:
+    """The fits of a stretch's own sets."""
+    how, stretch = job.how.get(), job.stretch
+    own = slice(stretch.first, stretch.last)
+    points, fits = _fits(how, stretch)
+    return _gather(how, stretch.markers[own], points, _rows(how, fits))
+
+
+def window_fits(job: FitJob) -> list[Fit]:
+    """The fits of those of a stretch's own sets that lie in a window."""
+    stretch = job.stretch
+    times_ns = stretch.markers.frame_timestamp_ns[stretch.first : stretch.last].tolist()
+    _, fits = _fits(job.how.get(), stretch)
+    return [fit for at, fit in zip(times_ns, fits, strict=True) if job.window_ns[0] <= at <= job.window_ns[1]]
+
+
+def window_ns(reference: Reference, start_ns: int) -> tuple[int, int] | None:
+    """From when to when a recorded reference's sets are; None when it is no window of this recording."""
+    if not isinstance(reference, Window):
+        return None
+    return start_ns + round(reference.begin_s * 1e9), start_ns + round(reference.end_s * 1e9)
+
+
+def touches(stretch: Stretch, window: tuple[int, int]) -> bool:
+    """Whether any of a stretch's own sets lies in a window."""
+    times_ns = stretch.markers.frame_timestamp_ns[stretch.first : stretch.last]
+    return bool(((times_ns >= window[0]) & (times_ns <= window[1])).any())
+
+
+def reference_shape(how: FitHow, side: str, reference: Reference, in_window: Iterable[Fit]) -> ReferenceShape:
+    """The shape that displacements of ``side`` are counted from; ``in_window`` are the window's fits, if it is one.
+
+    Raises UsageError when it has no fitted set, or does not fit the wing.
+    """
+    if reference is None:
+        return unloaded(how.half)
+    if isinstance(reference, Path):
+        return _from_file(how, side, reference / SHAPE if reference.is_dir() else reference)
+    found = mean_of(f"mean of {reference.begin_s:g} to {reference.end_s:g} s", how.half, in_window, how.shared)
+    if found is None:
+        raise UsageError(
+            f"--reference-window {reference.begin_s:g}:{reference.end_s:g}: no set of the {side} wing was fitted in it"
+        )
+    return found
+
+
+def prior_scale(how: FitHow, xyz_m: Floats, cov_m2: Floats) -> Floats | None:
+    """The prior's scale that these sets (``picks``) make likeliest; None where each set is to choose its own."""
+    if how.smooth_s == 0 and how.settings.prior_weight != "data":
+        return None
+    return common_scale(how.half, xyz_m, cov_m2, how.settings)
+
+
+def picks(count: int) -> Ints:
+    """Which of ``count`` sets with enough markers the prior's scale is chosen from: SCALE_SETS, spread evenly."""
+    return np.unique(np.linspace(0, count - 1, SCALE_SETS).round().astype(np.int64)) if count else np.empty(0, np.int64)
+
+
+def measured_markers(series: MarkerSeries) -> Bools:
+    """(F, M) whether a marker was measured, with a covariance."""
+    return np.asarray(series.seen & np.isfinite(series.cov_m2).all(axis=(-1, -2)))
+
+
+def enough_markers(series: MarkerSeries) -> Bools:
+    """(F,) whether enough markers were measured to fit a set."""
+    return np.asarray(measured_markers(series).sum(axis=1) >= FEWEST_MARKERS)
+
+
+def half_of(wing: Wing, side: str) -> HalfWing:
+    """The half wing of that name."""
     return wing.left if side == "left" else wing.right
 
 
-def _settings(wing: Wing) -> FitSettings:
-    if wing.fit is None:
-        raise UsageError(f"the wing {wing.name!r} has no [fit] section: say where its loads act (load_stations_m)")
-    return wing.fit
+def joined(parts: list[SideFits]) -> SideFits:
+    """Consecutive parts of one wing's fits as one."""
+    per_set: dict[str, Any] = {
+        member.name: np.concatenate([getattr(part, member.name) for part in parts])
+        for member in fields(SideFits)
+        if member.name not in _OF_THE_WING
+    }
+    return replace(parts[0], markers=MarkerSeries.join([part.markers for part in parts]), **per_set)
 
 
-def _as_in(half: HalfWing, series: MarkerSeries) -> MarkerSeries:
+def as_in(half: HalfWing, series: MarkerSeries) -> MarkerSeries:
     """``series`` with the wing's markers in the wing's order; those that the table lacks are not seen."""
     unknown = sorted(set(series.marker.tolist()) - set(half.marker_ids.tolist()))
     if unknown:
@@ -181,139 +317,36 @@ def _as_in(half: HalfWing, series: MarkerSeries) -> MarkerSeries:
     )
 
 
-def _side(wing: Wing, series: MarkerSeries, instants: InstantSettings | None, shared: SharedError | None) -> _Side:
-    half, settings, moved = _half(wing, series.side), _settings(wing), at_common_instant(series, instants)
-    scale = None
-    if settings.prior_weight == "data":
-        scale = common_scale(half, moved.xyz_m, moved.cov_m2, settings)
-    return _Side(half, settings, series, moved, scale, shared)
-
-
-def _blocks(own: _Side, reference: ReferenceShape) -> list[_Block]:
-    xyz, cov = own.moved.xyz_m, own.moved.cov_m2
-    return [
-        _Block(
-            own.series.side,
-            first,
-            xyz[first : first + BLOCK_SETS],
-            cov[first : first + BLOCK_SETS],
-            own.prior_scale,
-            own.shared,
-            reference,
-        )
-        for first in range(0, len(xyz), BLOCK_SETS)
-    ]
-
-
-def _reference(own: _Side, reference: Reference, start_ns: int) -> ReferenceShape:
-    """The side's shape that displacements are counted from; a window's sets are fitted for it first."""
-    if reference is None:
-        return unloaded(own.half)
-    if isinstance(reference, Path):
-        return _from_file(own, reference / SHAPE if reference.is_dir() else reference)
-    chosen = _in_window(own, reference, start_ns)
-    fits: list[Fit] = []
-    for block in _blocks(own, unloaded(own.half)):
-        inside = chosen[block.first : block.first + BLOCK_SETS]
-        if inside.any():
-            found = fits_in_turn(own.half, own.settings, block.xyz_m, block.cov_m2, block.prior_scale)
-            fits += [fit for fit, wanted in zip(found, inside, strict=True) if wanted]
-    return _mean_in_window(own, reference, start_ns, fits)
-
-
-def _from_file(own: _Side, path: Path) -> ReferenceShape:
-    table, side = read_table(path, ()), own.series.side
-    if "marker" not in table.column_names:
-        return recorded(table, path, side, own.half)
-    series = marker_series(table, str(path)).get(side)
-    if series is None:
-        raise UsageError(f"{path}: has no {side} wing; give a reference with every wing of this recording")
-    moved = at_common_instant(_as_in(own.half, series))
-    fits = list(fits_in_turn(own.half, own.settings, moved.xyz_m, moved.cov_m2, own.prior_scale))
-    shared = shared_errors(table).get(side)
-    same = shared is not None and own.shared is not None and shared.as_in(own.shared)
-    found = mean_of(str(path), own.half, fits, shared, same=same)
-    if found is None:
-        raise UsageError(f"{path}: the {side} wing at rest could not be fitted ({fits[0].reason})")
-    return found
-
-
-def _in_window(own: _Side, window: Window, start_ns: int) -> Bools:
-    since_s = (own.series.frame_timestamp_ns - start_ns) * 1e-9
-    return np.asarray((since_s >= window.begin_s) & (since_s <= window.end_s))
-
-
-def _mean_in_window(own: _Side, window: Window, start_ns: int, fits: Iterable[Fit]) -> ReferenceShape:
-    found = mean_of(f"mean of {window.begin_s:g} to {window.end_s:g} s", own.half, fits, own.shared)
-    if found is None:
-        since_s = (own.series.frame_timestamp_ns - start_ns) * 1e-9
-        raise UsageError(
-            f"--reference-window {window.begin_s:g}:{window.end_s:g}: no set of the {own.series.side} wing was fitted "
-            f"in it (the recording has {since_s.min():.1f} to {since_s.max():.1f} s)"
-        )
-    return found
-
-
-def _smoothed(
-    own: _Side, reference: Reference, start_ns: int, smooth_s: float, progress: Callable[[int], None] | None
-) -> SideFits:
-    series, moved = own.series, own.moved
-    if own.settings.loads != "everywhere":
-        raise UsageError('smoothing in time needs loads = "everywhere" in the wing file\'s [fit]')
+def _fits(how: FitHow, stretch: Stretch) -> tuple[Ints, Iterable[Fit]]:
+    """(F, M) samples that the markers of the stretch's own sets are made of, and their fits."""
+    series, own = stretch.markers, slice(stretch.first, stretch.last)
+    moved = at_common_instant(series, how.instants)
+    points = moved.points[own]
+    if how.smooth_s == 0:
+        return points, fits_in_turn(how.half, how.settings, moved.xyz_m[own], moved.cov_m2[own], how.prior_scale)
     time_s = (series.frame_timestamp_ns - series.frame_timestamp_ns[0]) * 1e-9
     if np.any(np.diff(time_s) <= 0):
         raise UsageError(f"{series.side} wing: times of the sets do not grow; smoothing in time needs that they do")
-    scale = common_scale(own.half, moved.xyz_m, moved.cov_m2, own.settings)
-    told = progress or (lambda _: None)
-    fits = smooth_fits(own.half, own.settings, moved.xyz_m, moved.cov_m2, time_s, scale, smooth_s, told)
-    if isinstance(reference, Window):
-        inside = _in_window(own, reference, start_ns)
-        shape = _mean_in_window(own, reference, start_ns, (fits[k] for k in np.flatnonzero(inside)))
-    else:
-        shape = _reference(own, reference, start_ns)
-    return _gather(own, shape, [_rows(own.half, fits, own.shared, shape)], smooth_s)
+    assert how.prior_scale is not None
+    fits = smooth_fits(how.half, how.settings, moved.xyz_m, moved.cov_m2, time_s, how.prior_scale, how.smooth_s)
+    return points, fits[own]
 
 
-def _fit_blocks(blocks: list[_Block], wing: Wing, workers: int) -> Iterator[tuple[_Block, _Rows]]:
-    """Blocks with their fits, in the order they get done."""
-    workers = min(workers, len(blocks))
-    if workers <= 1:
-        for block in blocks:
-            yield block, _fit_block(wing, block)
-        return
-    spawn = multiprocessing.get_context("spawn")
-    with (
-        one_blas_thread(),
-        ProcessPoolExecutor(workers, mp_context=spawn, initializer=_set_wing, initargs=(wing,)) as pool,
-    ):
-        pending = {pool.submit(_fit_block_here, block): block for block in blocks}
-        try:
-            for done in as_completed(list(pending)):
-                yield pending.pop(done), done.result()
-        except BrokenProcessPool as error:
-            raise ReconstructError("a worker process died while fitting (out of memory?); try --workers 1") from error
-        finally:
-            for future in pending:
-                future.cancel()
-
-
-_wing: Wing | None = None  # of a worker process, set once when it starts
-
-
-def _set_wing(wing: Wing) -> None:
-    global _wing
-    _wing = wing
-
-
-def _fit_block_here(block: _Block) -> _Rows:
-    assert _wing is not None
-    return _fit_block(_wing, block)
-
-
-def _fit_block(wing: Wing, block: _Block) -> _Rows:
-    half = _half(wing, block.side)
-    fits = fits_in_turn(half, _settings(wing), block.xyz_m, block.cov_m2, block.prior_scale)
-    return _rows(half, fits, block.shared, block.reference)
+def _from_file(how: FitHow, side: str, path: Path) -> ReferenceShape:
+    table = read_table(path, ())
+    if "marker" not in table.column_names:
+        return recorded(table, path, side, how.half)
+    series = marker_series(table, str(path)).get(side)
+    if series is None:
+        raise UsageError(f"{path}: has no {side} wing; give a reference with every wing of this recording")
+    moved = at_common_instant(as_in(how.half, series))
+    fits = list(fits_in_turn(how.half, how.settings, moved.xyz_m, moved.cov_m2, how.prior_scale))
+    shared = shared_errors(table).get(side)
+    same = shared is not None and how.shared is not None and shared.as_in(how.shared)
+    found = mean_of(str(path), how.half, fits, shared, same=same)
+    if found is None:
+        raise UsageError(f"{path}: the {side} wing at rest could not be fitted ({fits[0].reason})")
+    return found
 
 
 def fits_in_turn(
@@ -329,14 +362,15 @@ def fits_in_turn(
         yield fit
 
 
-def _rows(half: HalfWing, fits: Iterable[Fit], shared: SharedError | None, reference: ReferenceShape) -> _Rows:
+def _rows(how: FitHow, fits: Iterable[Fit]) -> _Rows:
     """What SideFits has of fits, an array a field; the rest of a fit is dropped here, where it was made."""
     rows = []
+    reference = how.reference or unloaded(how.half)
     waiting = iter(fits)
-    while block := list(itertools.islice(waiting, BLOCK_SETS)):
-        responses = None if shared is None else shared.of_shapes(half, block)
-        for k, fit in enumerate(block):
-            rows.append(_row(half, fit, None if responses is None else responses[k], reference))
+    while some := list(islice(waiting, SETS_AT_ONCE)):
+        responses = None if how.shared is None else how.shared.of_shapes(how.half, some)
+        for k, fit in enumerate(some):
+            rows.append(_row(how.half, fit, None if responses is None else responses[k], reference))
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
@@ -358,6 +392,8 @@ def _row(half: HalfWing, fit: Fit, shared: Floats | None, reference: ReferenceSh
         "sigma_twisted_rad": sigma_change[:, 3],
         "curvature_1pm": _at_nodes(fit.strain[:, 1:]),
         "sigma_curvature_1pm": _at_nodes(fit.sigma_strain[:, 1:]),
+        "extension": _at_nodes(fit.strain[:, 0]),
+        "sigma_extension": _at_nodes(fit.sigma_strain[:, 0]),
         "stiffness_change": fit.stiffness_change,
         "sigma_stiffness": fit.sigma_stiffness,
         "residual_m": fit.residual_m,
@@ -380,12 +416,11 @@ def _at_nodes(of_elements: Floats) -> Floats:
     return np.asarray((padded[:-1] + padded[1:]) / 2)
 
 
-def _gather(own: _Side, reference: ReferenceShape, blocks: list[_Rows], smoothed_s: float = 0.0) -> SideFits:
-    half, series, moved = own.half, own.series, own.moved
-    rows = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+def _gather(how: FitHow, series: MarkerSeries, points: Ints, rows: _Rows) -> SideFits:
+    half, reference = how.half, how.reference or unloaded(how.half)
     outliers = rows.pop("outliers")
     reason = rows.pop("reason").astype(object)
-    alone = (rows["used"] & (moved.points == 1)).any(axis=1)
+    alone = (rows["used"] & (points == 1)).any(axis=1)
     bridged = (reason == "") & ~rows["used"].any(axis=1)
     flagged = {"not_fitted": reason != "", "outlier": outliers > 0, "row_time": alone, "bridged": bridged}
     return SideFits(
@@ -398,8 +433,8 @@ def _gather(own: _Side, reference: ReferenceShape, blocks: list[_Rows], smoothed
         reference_xyz_m=reference.xyz_m,
         reference_twist_rad=reference.twist_rad,
         markers=series,
-        points=moved.points,
-        load_s_m=np.array(own.settings.load_stations_m),
+        points=points,
+        load_s_m=np.array(how.settings.load_stations_m),
         flags=np.array(
             [
                 ",".join(name for name, applies in zip(flagged, row, strict=True) if applies)
@@ -408,7 +443,7 @@ def _gather(own: _Side, reference: ReferenceShape, blocks: list[_Rows], smoothed
             dtype=object,
         ),
         reason=reason,
-        smoothed_s=smoothed_s,
+        smoothed_s=how.smooth_s,
         **rows,
     )
 

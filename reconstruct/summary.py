@@ -1,66 +1,113 @@
 """Fits of a flight → the figures of summary.json, and the same in words."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from process.json_file import finite_or_none
 from reconstruct.series import SideFits
-from reconstruct.tables import Floats
+from reconstruct.tables import STIFFNESS_COLUMNS, TIP_COLUMNS, Floats
+
+HOLES_LISTED = 100
+_FITTED, _NOT_FITTED, _ABSENT = range(3)
 
 
-def summarise(fits: Mapping[str, SideFits]) -> dict[str, Any]:
+def tally(fits: SideFits) -> dict[str, float]:
+    """What of some sets adds up to the figures of a flight."""
+    seen, residual = fits.markers.seen, np.linalg.norm(fits.residual_m, axis=-1)
+    known = np.isfinite(residual)
+    fitted = fits.converged
+    return {
+        "sets": fitted.size,
+        "fitted": int(fitted.sum()),
+        "markers": seen.size,
+        "seen": int(seen.sum()),
+        "left_out": int((known & ~fits.used).sum()),
+        "used": int((known & fits.used).sum()),
+        "residual_mm2": float(np.sum((1e3 * residual[known & fits.used]) ** 2)),
+        "chi2": float(np.nansum(fits.chi2[fitted])),
+        "dof": float(np.nansum(fits.dof[fitted])),
+    }
+
+
+def summarise(tallies: Mapping[str, Sequence[Mapping[str, float]]], frames: pa.Table) -> dict[str, Any]:
     """Counts and figures over all sides, and the same by side under ``by_side``.
 
     Each key is defined in docs/explanation/errors-defined.md.
+
+    Args:
+        tallies: of each side's parts.
+        frames: frames.parquet.
     """
-    sides = [fits[side] for side in sorted(fits)]
-    triggers = np.unique(np.concatenate([side.trigger_index for side in sides]))
-    times = np.concatenate([side.timestamp_ns for side in sides])
+    triggers = np.unique(frames.column("trigger_index").to_numpy())
+    times = frames.column("timestamp_ns").to_numpy()
     return {
         "triggers": int(triggers.size),
         "triggers_missing": int(triggers[-1] - triggers[0] + 1 - triggers.size),
         "start_utc": str(np.datetime64(int(times.min()), "ns")) + "Z",
         "duration_s": float((times.max() - times.min()) * 1e-9),
-        "sides": [side.side for side in sides],
-        "reference": sides[0].reference,
-        "smoothed_s": sides[0].smoothed_s,
-        **_figures(sides),
-        "by_side": {side.side: _figures([side]) for side in sides},
+        "sides": sorted(tallies),
+        **_figures([one for parts in tallies.values() for one in parts], frames),
+        "by_side": {
+            side: _figures(tallies[side], frames.filter(pc.equal(frames.column("side"), side)))
+            for side in sorted(tallies)
+        },
     }
 
 
-def _figures(sides: list[SideFits]) -> dict[str, Any]:
-    seen = np.concatenate([side.markers.seen.ravel() for side in sides])
-    used = np.concatenate([side.used.ravel() for side in sides])
-    residual = np.concatenate([np.linalg.norm(side.residual_m, axis=-1).ravel() for side in sides])
-    fitted = np.concatenate([side.converged for side in sides])
-    chi2, dof = (np.concatenate([getattr(side, name) for side in sides]) for name in ("chi2", "dof"))
-    outlier = np.isfinite(residual) & ~used
-    tip = np.concatenate([np.linalg.norm(side.sigma_moved_m[:, -1], axis=-1) for side in sides])
-    twist = np.degrees(np.concatenate([side.sigma_twisted_rad[:, -1] for side in sides]))
+def holes(frames: pa.Table) -> dict[str, Any]:
+    """Where a wing has no shape, between the first and the last trigger of the flight: runs of consecutive triggers.
+
+    ``holes`` lists the first HOLES_LISTED, ``sets_without_shape`` counts all.
+    """
+    trigger, side = frames.column("trigger_index").to_numpy(), frames.column("side").to_numpy(zero_copy_only=False)
+    fitted = np.isfinite(frames.column(TIP_COLUMNS[2]).to_numpy())
+    first, count = int(trigger.min()), int(np.ptp(trigger)) + 1
+    listed: list[dict[str, Any]] = []
+    missing = 0
+    for one in sorted(set(side)):
+        state = np.full(count + 2, _FITTED)
+        state[1:-1] = _ABSENT
+        own = side == one
+        state[trigger[own] - first + 1] = np.where(fitted[own], _FITTED, _NOT_FITTED)
+        missing += int((state != _FITTED).sum())
+        for begin, end in pairwise((np.flatnonzero(np.diff(state)) + 1).tolist()):
+            if state[begin] != _FITTED:
+                why = "no set recorded, or none readable" if state[begin] == _ABSENT else "not fitted"
+                run = {"first_trigger": first + begin - 1, "last_trigger": first + end - 2, "reason": why}
+                listed.append({"side": one, **run})
+    return {"sets_without_shape": missing, "holes": listed[:HOLES_LISTED]}
+
+
+def _figures(parts: Sequence[Mapping[str, float]], frames: pa.Table) -> dict[str, Any]:
+    sums = {key: sum(part[key] for part in parts) for key in parts[0]}
+    tip_m = np.linalg.norm(_columns(frames, [f"sigma_{name}" for name in TIP_COLUMNS[:3]]), axis=0)
+    twist_deg = _columns(frames, [f"sigma_{TIP_COLUMNS[3]}"])[0]
     return {
-        "sets": int(fitted.size),
-        "converged_percent": float(100 * fitted.mean()),
-        "markers_seen_percent": float(100 * seen.mean()),
-        "markers_left_out_percent": float(100 * outlier.sum() / max(1, int(seen.sum()))),
-        "residual_rms_mm": _rms(1e3 * residual[used & np.isfinite(residual)]),
-        "chi2_per_dof": finite_or_none(np.nansum(chi2[fitted]) / np.nansum(dof[fitted])) if fitted.any() else None,
-        "stiffness_change_percent": _stiffness(sides, "stiffness_change"),
-        "sigma_stiffness_percent": _stiffness(sides, "sigma_stiffness"),
-        "sigma_tip_mm": _median(1e3 * tip),
-        "sigma_tip_twist_deg": _median(twist),
+        "sets": sums["sets"],
+        "converged_percent": 100 * sums["fitted"] / sums["sets"],
+        "markers_seen_percent": 100 * sums["seen"] / sums["markers"],
+        "markers_left_out_percent": 100 * sums["left_out"] / max(1, sums["seen"]),
+        "residual_rms_mm": float(np.sqrt(sums["residual_mm2"] / sums["used"])) if sums["used"] else None,
+        "chi2_per_dof": finite_or_none(sums["chi2"] / sums["dof"]) if sums["fitted"] else None,
+        "stiffness_change_percent": _stiffness(frames, ""),
+        "sigma_stiffness_percent": _stiffness(frames, "sigma_"),
+        "sigma_tip_mm": _median(1e3 * tip_m),
+        "sigma_tip_twist_deg": _median(twist_deg),
     }
 
 
-def _stiffness(sides: list[SideFits], name: str) -> dict[str, float | None]:
-    percent = 100 * np.concatenate([getattr(side, name) for side in sides])
-    return {key: _median(percent[:, at]) for at, key in enumerate(("EA", "GJ", "EI_out", "EI_in"))}
+def _stiffness(frames: pa.Table, prefix: str) -> dict[str, float | None]:
+    percent = 100 * _columns(frames, [prefix + name for name in STIFFNESS_COLUMNS])
+    return {key: _median(values) for key, values in zip(("EA", "GJ", "EI_out", "EI_in"), percent, strict=True)}
 
 
-def _rms(values: Floats) -> float | None:
-    return float(np.sqrt(np.mean(values**2))) if values.size else None
+def _columns(frames: pa.Table, names: Sequence[str]) -> Floats:
+    return np.stack([frames.column(name).to_numpy() for name in names])
 
 
 def _median(values: Floats) -> float | None:

@@ -1,7 +1,7 @@
 """Tables of a result folder: Parquet (and CSV) on disk ⇄ dense arrays, one set of arrays a side."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +32,12 @@ SIGMA = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 MOVED = ("dx_m", "dy_m", "dz_m")
 TIP_COLUMNS = ("tip_dx_m", "tip_dy_m", "tip_dz_m", "tip_twist_deg")
 CURVATURE = ("curvature_twist_1pm", "curvature_out_1pm", "curvature_in_1pm")
+STIFFNESS_COLUMNS = ("stiffness_ea", "stiffness_gj", "stiffness_ei_out", "stiffness_ei_in")
 REFERENCE_POSITION = ("reference_x_m", "reference_y_m", "reference_z_m")
 RESIDUAL = ("residual_x_m", "residual_y_m", "residual_z_m")
 LOAD_COLUMNS = ("fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
 NET_COLUMNS = tuple(f"net_{name}" for name in LOAD_COLUMNS)
+_PER_SET = ("trigger_index", "frame_timestamp_ns", "timestamp_ns", "xyz_m", "cov_m2", "flags")  # of MarkerSeries
 _TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -56,6 +58,16 @@ class MarkerSeries:
     def seen(self) -> Bools:
         """(F, M) whether the marker has a position."""
         return np.asarray(np.isfinite(self.xyz_m).all(axis=-1))
+
+    def __getitem__(self, rows: slice) -> "MarkerSeries":
+        """Some of the sets."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _PER_SET})
+
+    @classmethod
+    def join(cls, parts: Sequence["MarkerSeries"]) -> "MarkerSeries":
+        """The sets of all ``parts``, at least one, which have the same markers."""
+        whole: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _PER_SET}
+        return replace(parts[0], **whole)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import typer
 from capture.console import run
 from capture.errors import ProcessError
 from process.markers_command import markers as markers_command
-from process.pipeline import PipelineSettings, markers
+from process.pipeline import PipelineSettings, blocks, markers
 from process.recording import open_recording
 from process.shared_error import sides_of
 from process.tables import MARKER_SCHEMA, read_table, table_provenance, write_table
@@ -230,10 +230,8 @@ def test_tables_survive_the_round_trip_and_bad_ones_are_named(result, tmp_path):
 
 
 def test_a_block_ends_where_the_trigger_number_says(flight):
-    from process.pipeline import _blocks
-
-    cut = [[places.trigger_index for places in block] for block in _blocks(open_recording([flight]))]
-    assert cut == [[48, 49], [50, 51], [48, 49], [50, 51]]
+    cut = [(b.side, [places.trigger_index for places in b.places]) for b in blocks(open_recording([flight]))]
+    assert cut == [("left", [48, 49]), ("right", [48, 49]), ("left", [50, 51]), ("right", [50, 51])]
 
 
 def test_the_commands_table_carries_the_rig(flight, small_world, tmp_path, capsys):

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from process.pipeline import MarkersResult
 from reconstruct.cli import main
 from reconstruct.result_tables import result_tables
 from reconstruct.series import fit_series
@@ -100,7 +99,7 @@ def test_summary(out: Path) -> None:
     # 5 % of 216 markers are missing: ± 3 sigma = 3 × 1.5 %
     assert summary["markers_seen_percent"] == pytest.approx(95.0, abs=4.5)
     assert summary["residual_rms_mm"] == pytest.approx(1.7, abs=0.4)  # √3 mm, less what 18 markers' fit takes up
-    assert set(summary["timing_s"]) == {"markers", "fit", "tables", "report"}
+    assert set(summary["timing_s"]) == {"start", "markers", "fit", "tables", "report"}
     assert summary["wall_s"] >= sum(summary["timing_s"].values()) - 0.1
     assert set(summary["by_side"]) == {"left", "right"}
 
@@ -120,34 +119,6 @@ def test_compare_and_report(out: Path, bending_wing: Any, tmp_path: Path) -> Non
     again = reconstruct("report", out, "--compare", tmp_path / "compared" / "comparison.json")
     assert again.returncode == 0, again.stderr
     assert "Error against the reference" in (out / "report.html").read_text()
-
-
-def test_frames_go_through_the_marker_pipeline(
-    table: Path, wing_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is measured is tested in process; here, that flights, rig and warnings are handed on."""
-    asked: dict[str, Any] = {}
-
-    def measure(flights: Any, rig: Any, progress: Any, workers: int) -> MarkersResult:
-        asked.update(flights=flights, rig=rig, workers=workers)
-        progress(12, 12)
-        return MarkersResult(pq.read_table(table), 12, 0.1, tuple(f"trigger {i} has no cam1" for i in range(30)), {})
-
-    monkeypatch.setattr("reconstruct.run.measure_markers", measure)
-    monkeypatch.setattr("reconstruct.run.Rig.read", lambda path: path)
-    (tmp_path / "rig.json").write_text("{}")
-    disks = [tmp_path / "ssd0", tmp_path / "ssd1"]
-    for disk in disks:
-        disk.mkdir()
-    done = reconstruct(
-        *disks, "--rig", tmp_path / "rig.json", "--wing", wing_file, "-o", tmp_path / "out", "--workers", 1
-    )
-    assert done.returncode == 0, done.stderr
-    assert asked == {"flights": tuple(disks), "rig": tmp_path / "rig.json", "workers": 1}
-    assert done.stderr.splitlines()[0] == "warning: trigger 0 has no cam1"
-    assert done.stderr.splitlines()[-1] == "warning: and 10 more"
-    assert pq.read_table(tmp_path / "out" / "markers.parquet").num_rows == 6 * 36
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["flights"] == [str(disk) for disk in disks]
 
 
 @pytest.mark.slow

@@ -11,11 +11,12 @@ import pyarrow.parquet
 import pytest
 
 from capture.errors import UsageError
+from process.pipeline import BLOCK_TRIGGERS
 from process.reference import Window, rest_shape
 from process.tables import MARKER_SCHEMA
 from reconstruct.instants import InstantSettings, at_common_instant
 from reconstruct.result_tables import frames_table, result_tables
-from reconstruct.series import BLOCK_SETS, fit_series
+from reconstruct.series import fit_series
 from reconstruct.tables import marker_series
 from reconstruct.wing import read_wing
 
@@ -112,12 +113,12 @@ class TestSeries:
 
     @pytest.mark.slow
     def test_the_number_of_workers_changes_nothing(self, bending_wing: Any, wing_file: Path) -> None:
-        table = bending_wing().marker_table(np.arange(BLOCK_SETS + 3) * 0.04, sigma_m=SIGMA_M)
+        table = bending_wing().marker_table(np.arange(BLOCK_TRIGGERS + 3) * 0.04, sigma_m=SIGMA_M)
         series, wing = marker_series(table, "made"), read_wing(wing_file)
         told: list[int] = []
         one = fit_series(series, wing, workers=1, progress=told.append)
         two = fit_series(series, wing, workers=2)
-        assert sum(told) == 2 * (BLOCK_SETS + 3)
+        assert sum(told) == 2 * (BLOCK_TRIGGERS + 3)
         for side in one:
             # to rounding: a worker process runs its linear algebra on one thread, this one may run it on several
             assert np.allclose(one[side].xyz_m, two[side].xyz_m, rtol=0, atol=1e-9)

@@ -1,0 +1,123 @@
+"""A rendered flight of any length, written by the recorder's own segment writer as fast as the frames can be drawn.
+
+``python rendered_flight.py WORLD OUT SECONDS [--sunlit A:B]`` writes ``OUT/ssd_left``, ``…_right`` and ``OUT/truth``.
+What it draws is what ``wingsim rig`` would have delivered; only the waiting is left out.
+"""
+
+import argparse
+import multiprocessing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from capture.disk import SystemDisk
+from capture.record import SIDES, Frame
+from capture.recorder import camera_channels
+from capture.ring import Ring
+from capture.segment import FrameLayout, SegmentWriter
+from capture.trigger_protocol import Pulse
+from hw_sim.render import LiveRenderer, noise_frames
+from hw_sim.truth import AROUND_NS, write_truth
+from hw_sim.world import World
+from process.camera_model import CameraModel, MarkerLayout, Rig, RigSide, StereoPair
+
+SEGMENT_S = 10
+CAMERAS = ("cam0", "cam1")
+Stretch = tuple[float, float]  # from, to, seconds after the first trigger
+
+
+def write_flight(world: World, folder: Path, seconds: float, sunlit: Stretch = (0.0, 0.0)) -> tuple[Path, Path]:
+    """Write a flight, in the sun during ``sunlit``, and its truth; returns the folders of its two disks."""
+    spawn = multiprocessing.get_context("spawn")
+    folders = tuple(folder / f"ssd_{side}" for side in SIDES)
+    for own in folders:
+        own.mkdir(parents=True)
+    with spawn.Pool(len(SIDES)) as pool:
+        pool.starmap(
+            _write_side, [(world, side, own, seconds, sunlit) for side, own in zip(SIDES, folders, strict=True)]
+        )
+    edges = [_edge_ns(world, trigger) for trigger in range(_triggers(world, seconds))]
+    pulses = [Pulse(index, index, edge, edge) for index, edge in enumerate(edges)]
+    write_truth(world, edges[0] - AROUND_NS, edges[-1] + AROUND_NS, folder / "truth", pulses)
+    return folders[0], folders[1]
+
+
+def true_rig(world: World) -> Rig:
+    """The rig file that a calibration without any error would give."""
+    sides = {}
+    for side in SIDES:
+        cam0, cam1 = (camera for camera in world.cameras if camera.side == side)
+        poses = [np.array(camera.T_body_cam) for camera in (cam0, cam1)]
+        models = [
+            CameraModel.from_intrinsics(
+                world.sensor.width_px,
+                world.sensor.height_px,
+                [one.fx, one.fy, one.cx, one.cy, one.k1, one.k2, one.p1, one.p2, one.k3],
+            )
+            for one in (cam0, cam1)
+        ]
+        pair = StereoPair(models[0], models[1], np.linalg.inv(poses[1]) @ poses[0])
+        sides[side] = RigSide(pair, poses[0], cam0.serial, cam1.serial, cam0.row_time_us * 1e3)
+    leds = world.leds
+    return Rig(sides["left"], sides["right"], MarkerLayout(leds.pairs_station_m, leds.chord_m, leds.height_m))
+
+
+def _triggers(world: World, seconds: float) -> int:
+    return round(seconds * world.trigger_rate_hz)
+
+
+def _edge_ns(world: World, trigger: int) -> int:
+    return world.epoch_ns + round((trigger + 1) * 1e9 / world.trigger_rate_hz)
+
+
+def _write_side(world: World, side: str, folder: Path, seconds: float, sunlit: Stretch) -> None:
+    cameras = [camera for camera in world.cameras if camera.side == side]
+    width, height = world.sensor.width_px, world.sensor.height_px
+    scenes = (world, replace(world, scene=replace(world.scene, background="sunlit")))
+    noise = [noise_frames(scene, cameras[0].exposure_us, cameras[0].gain_db) for scene in scenes]
+    artists = [
+        [LiveRenderer(scene, camera, drawn, camera.exposure_us, camera.gain_db) for camera in cameras]
+        for scene, drawn in zip(scenes, noise, strict=True)
+    ]
+    layouts = [FrameLayout(3 * at + 1, 3 * at + 2, f"{side}_{name}", width, height) for at, name in enumerate(CAMERAS)]
+    ring = Ring(1, layouts[0].slot_bytes, lock_memory=False)
+    slot = ring.slot(0)
+    writer = None
+    for trigger in range(_triggers(world, seconds)):
+        if trigger % round(SEGMENT_S * world.trigger_rate_hz) == 0:
+            if writer is not None:
+                writer.close()
+            path = folder / f"{side}_{trigger // round(SEGMENT_S * world.trigger_rate_hz):04d}.mcap"
+            writer = SegmentWriter(SystemDisk(), path, camera_channels(CAMERAS, side), {"side": side})
+        assert writer is not None
+        in_sun = sunlit[0] <= trigger / world.trigger_rate_hz < sunlit[1]
+        for camera, artist, layout in zip(cameras, artists[in_sun], layouts, strict=True):
+            edge_ns = _edge_ns(world, trigger)
+            pixels = np.frombuffer(layout.pixels(slot), np.uint8).reshape(height, width)
+            artist.render(edge_ns, pixels)
+            row_time_ns = round(camera.row_time_us * 1000)
+            frame = Frame(
+                trigger, trigger, edge_ns, edge_ns, edge_ns, edge_ns + 25_000_000, 1000, camera.exposure_us,
+                row_time_ns, 1, 1000, camera.gain_db, 9, 0,
+            )  # fmt: skip
+            middle_ns = frame.mid_exposure_ns + (height - 1) * row_time_ns // 2
+            writer.write_frame(layout.seal(slot, frame, middle_ns))
+    if writer is not None:
+        writer.close()
+
+
+def main() -> None:
+    """Write a flight."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("world", type=Path)
+    options.add_argument("out", type=Path)
+    options.add_argument("seconds", type=float)
+    options.add_argument("--sunlit", default="0:0")
+    given = options.parse_args()
+    begin, end = (float(part) for part in given.sunlit.split(":"))
+    write_flight(World.read(given.world), given.out, given.seconds, (begin, end))
+
+
+if __name__ == "__main__":
+    main()
