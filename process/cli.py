@@ -6,6 +6,7 @@ from capture.console import run
 from process.accuracy_command import accuracy
 from process.calibrate_command import calibrate
 from process.markers_command import markers
+from process.monitor_command import monitor
 from process.plan_command import plan
 from process.reference_command import reference
 from process.repose_command import repose
@@ -19,6 +20,7 @@ app.command()(reference)
 app.command()(markers)
 app.command()(accuracy)
 app.command()(plan)
+app.command()(monitor)
 
 
 def main() -> None:
