@@ -4,10 +4,12 @@ Everything here is read from counters; nothing waits for a device, a disk or a t
 crew is in docs/reference/health.md.
 """
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 from capture.clock import Clock
@@ -76,10 +78,14 @@ class Vitals:
         self._samples: deque[_Sample] = deque()
         self._changed: dict[object, tuple[float, int]] = {}  # when a count last rose, and the triggers by then
         self._started_s: float | None = None
+        self._devices: dict[Path, int] = {}  # file systems of the disks
         self._mutex = threading.Lock()
 
     def begin(self, lanes: Mapping[str, Lane]) -> None:
         """The lanes are made and the triggers begin."""
+        disks = {lane.recorder.folder.parent for lane in lanes.values()}
+        with contextlib.suppress(OSError):  # of a disk that is gone already
+            self._devices = {disk: disk.stat().st_dev for disk in disks}
         with self._mutex:
             self._lanes = lanes
             self._started_s = self._clock.monotonic_s()
@@ -193,7 +199,7 @@ class Vitals:
         if self.state != "recording":
             return OK, self.state
         if not grabber.running:
-            return ERROR, str(grabber.error or "its read thread has ended")
+            return ERROR, str(grabber.error or "its read thread has ended").removeprefix(f"{health.place}: ")
         if grabber.is_absent:
             return ERROR, f"{grabber.absences[-1].cause}; looked for: {grabber.seek_error or 'not yet'}"
         if unanswered > max(3.0, SILENT_S * rate_hz):
@@ -255,10 +261,15 @@ class Vitals:
         return OK, health.write_mode
 
     def _bytes_per_second(self, recorder: Recorder) -> float:
-        """What its disk is asked to take; of both sides after a takeover, nothing after a failure."""
-        disk = recorder.folder.parent
+        """What its disk is asked to take, by both sides where they share it; nothing after a failure."""
+
+        def device(recorder: Recorder) -> object:
+            return self._devices.get(recorder.folder.parent, recorder.folder.parent)
+
         here = [
-            lane for lane in self._lanes.values() if lane.recorder.folder.parent == disk and not lane.recorder.failure
+            lane
+            for lane in self._lanes.values()
+            if device(lane.recorder) == device(recorder) and not lane.recorder.failure
         ]
         rings = [grabber.ring for lane in here for grabber in lane.grabbers.values()]
         return sum(ring.slot_bytes for ring in rings) * self._config.trigger.rate_hz

@@ -4,6 +4,7 @@ import typer
 
 from capture.console import run
 from process.accuracy_command import accuracy
+from process.aim_command import aim
 from process.calibrate_command import calibrate
 from process.markers_command import markers
 from process.monitor_command import monitor
@@ -21,6 +22,7 @@ app.command()(markers)
 app.command()(accuracy)
 app.command()(plan)
 app.command()(monitor)
+app.command()(aim)
 
 
 def main() -> None:

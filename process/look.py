@@ -1,7 +1,7 @@
 """A frame to the figures that tell of aperture, exposure, focus and light: what ``aim`` and the monitor show.
 
 Each spot is measured by its radial profile: brightness over its local background against the distance from its centre.
-Radii are where that profile falls to a level, which is a share of the peak; for a saturated spot, of what is left of it.
+Radii are where that profile falls to a level: a share of the peak; of a saturated spot, of what is left of it.
 """
 
 from collections import Counter
@@ -36,6 +36,8 @@ class Look:
     saturated_markers: int
     amplitude: float
     """median over the spots, above their background, as fitted: beyond 255 where saturated"""
+    brightest: float
+    """of the spots' amplitudes the highest but one, of three and more; else the highest"""
     diameter_px: float
     """median, at half of the peak"""
     circularity: float
@@ -69,6 +71,7 @@ def look_at(image: Pixels, settings: DetectSettings | None = None) -> Look:
         markers=len(found),
         saturated_markers=saturated,
         amplitude=_median(found.amplitude),
+        brightest=-_low(-found.amplitude),
         diameter_px=_median(2.0 * radii[:, 1]),
         circularity=_low(found.circularity),
         edge_px=_median(radii[:, 2] - radii[:, 0]),

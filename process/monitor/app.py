@@ -22,6 +22,7 @@ from process.monitor.metrics import CONTENT_TYPE, metrics_text, ptp_offset_ns
 _FRESH_S = 0.1  # health is read at most so often, however many ask
 _PAGE = {
     "": ("index.html", "text/html; charset=utf-8"),
+    "icon.svg": ("icon.svg", "image/svg+xml"),
     "monitor.css": ("monitor.css", "text/css; charset=utf-8"),
     "monitor.js": ("monitor.js", "text/javascript; charset=utf-8"),
 }

@@ -46,7 +46,7 @@ class _Text:
         self._add("counter", name, what, samples)
 
     def _add(self, kind: str, name: str, what: str, samples: Iterable[_Sample]) -> None:
-        lines = [f"{name}{_labels(labels)} {value:.17g}\n" for labels, value in samples if value is not None]
+        lines = [f"{name}{_labels(labels)} {float(value)!r}\n" for labels, value in samples if value is not None]
         if lines:
             self.text += f"# HELP {name} {what}\n# TYPE {name} {kind}\n{''.join(lines)}"
 

@@ -92,8 +92,9 @@ function cameras(status) {
     article.classList.toggle("bad", bad.has(place));
     put("rate", `${number(camera.rate_hz, 1)} Hz`);
     put("lost", String(Object.values(camera.lost).reduce((sum, count) => sum + count, 0)));
-    put("markers", picture ? String(picture.markers) : "–");
-    put("saturated", picture ? `${picture.saturated_markers} · ${(100 * picture.saturated_share).toFixed(2)} %` : "–");
+    const bright = picture && picture.saturated_markers ? `, ${picture.saturated_markers} sat.` : "";
+    put("markers", picture ? `${picture.markers}${bright}` : "–");
+    put("saturated", picture ? `${(100 * picture.saturated_share).toFixed(2)} %` : "–");
     put("temperature", camera.temperature_c === null ? "–" : `${number(camera.temperature_c)} °C`);
     put("old", !picture ? "no picture" : picture.age_s > OLD_PICTURE_S ? `picture is ${number(picture.age_s)} s old` : "");
     const ring = article.querySelector(".ring");
