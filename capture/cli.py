@@ -21,10 +21,17 @@ from capture.daemon import Recording, RecordingResult, StopRule
 from capture.devices_command import devices
 from capture.disk import SystemDisk
 from capture.errors import CaptureError, UsageError
+from capture.export_command import export
 from capture.finding import Finding, Situation
 from capture.health_writer import HealthWriter
+from capture.install_command import install, uninstall
+from capture.journal import Journal
+from capture.lock import sole_recorder
+from capture.notify import Notifier, journal_listens
 from capture.preflight import preflight as run_checks
 from capture.recover import recover_flight
+from capture.service import Service
+from capture.unfinished import AfterPower
 from capture.verify import FlightReport, inspect
 
 app = typer.Typer(
@@ -49,15 +56,19 @@ def record(
     requested = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: requested.set())
-    narrator = Narrator()
     loaded, clock = load_config(config), SystemClock()
-    with HealthWriter(loaded.config, clock, narrator) as health:
-        recording = Recording(loaded, clock, SystemDisk(), narrator, make_companions(loaded.config, clock), health)
-        narrator(f"recording {recording.flight}")
+    disks = (loaded.config.disks.left, loaded.config.disks.right)
+    service = Service(loaded.config, clock, Journal() if journal_listens() else Narrator(), Notifier())
+    companions = [*make_companions(loaded.config, clock), AfterPower(disks)]
+    with sole_recorder(disks), HealthWriter(loaded.config, clock, service.event) as health:
+        recording = Recording(loaded, clock, SystemDisk(), service.event, companions, health, service)
+        service.event(f"recording {recording.flight}")
         result = recording.run(StopRule(requested, triggers, duration))
-    narrator.close()
+    service.close()
     if json:
         say_json(result.as_dict())
+    elif service.managed:
+        say(_summary(result))
     else:
         _print_result(result)
     if result.failures:
@@ -192,16 +203,25 @@ def bench(
         say(bench_report.ceiling_line(found))
 
 
+app.command()(export)
+app.command()(install)
+app.command()(uninstall)
+
+
 def main() -> None:
     """Entry point."""
     run(app)
 
 
-def _print_result(result: RecordingResult) -> None:
-    say(
+def _summary(result: RecordingResult) -> str:
+    return (
         f"{result.flight}: {result.triggers} triggers in {result.seconds:.1f} s, "
         f"{result.recorded} frames recorded, {result.lost} lost"
     )
+
+
+def _print_result(result: RecordingResult) -> None:
+    say(_summary(result))
     table = Table("camera", "recorded", "lost", "ring high water", title=None)
     for place, account in result.accounts.items():
         lost = ", ".join(f"{n} at {stage}" for stage, n in account.lost.items()) or "0"

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from capture.camera import BACKENDS
 from capture.camera.base import CameraSettings
 from capture.errors import ConfigError
+from capture.placement import Placement
 from capture.trigger_protocol import MAX_CHANNELS
 
 MAX_PREVIEW_HZ = 2.0  # a preview is a copy of a whole frame
@@ -64,6 +65,35 @@ class HealthConfig(_Table):
 
     folder: Path | None = None  # None: capture.health.default_folder
     preview_hz: Annotated[float, Field(ge=0, le=MAX_PREVIEW_HZ)] = MAX_PREVIEW_HZ  # a camera; 0: none
+
+
+_Priority = Annotated[int, Field(ge=0, le=99)]
+_Cpus = list[Annotated[int, Field(ge=0, lt=1024)]]
+
+
+class ThreadsConfig(_Table):
+    """Real-time priorities (SCHED_FIFO, 0: none) and processors ([]: any) of the recorder's threads."""
+
+    read_priority: _Priority = 0  # one read thread a camera
+    write_priority: _Priority = 0  # one write thread a disk
+    control_priority: _Priority = 0  # the control thread and the trigger board's
+    read_cpus: _Cpus = []
+    write_cpus: _Cpus = []
+
+    @property
+    def read(self) -> Placement:
+        """Of the read threads."""
+        return Placement(self.read_priority, tuple(self.read_cpus))
+
+    @property
+    def write(self) -> Placement:
+        """Of the write threads."""
+        return Placement(self.write_priority, tuple(self.write_cpus))
+
+    @property
+    def control(self) -> Placement:
+        """Of what else must keep up."""
+        return Placement(self.control_priority)
 
 
 class CameraDefaults(_Table):
@@ -148,6 +178,7 @@ class Config(_Table):
     ring: RingConfig = RingConfig()
     health: HealthConfig = HealthConfig()
     ptp: PtpConfig | None = None
+    threads: ThreadsConfig = ThreadsConfig()
     flight: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     calibration: Path | None = None
     can: list[CanConfig] = []

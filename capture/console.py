@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 import typer
 
 from capture.errors import WingshapeError
+from capture.notify import journal_listens
 
 
 def run(app: typer.Typer) -> NoReturn:
@@ -38,7 +39,8 @@ def run(app: typer.Typer) -> NoReturn:
 def _fail(message: str, code: int) -> NoReturn:
     if os.environ.get("WINGSHAPE_DEBUG") and sys.exc_info()[1] is not None:
         raise  # called from an except block only
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
+    priority = "<3>" if journal_listens() else ""  # sd-daemon(3): the journal takes it off, and shows an error
+    print(f"{priority}error: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
     sys.exit(code)
 
 

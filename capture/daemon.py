@@ -17,7 +17,7 @@ from capture.clock import Clock
 from capture.config import Config, LoadedConfig
 from capture.disk import Disk
 from capture.errors import DiskError
-from capture.flight import metadata_yaml
+from capture.flight import free_name, metadata_yaml
 from capture.gates import Gates, judge_cameras, judge_clock
 from capture.grabber import STOP_DEADLINE_S, Absence, Grabber
 from capture.health_writer import HealthWriter
@@ -27,10 +27,12 @@ from capture.provenance import describe_cameras, describe_config, describe_host,
 from capture.ptp import FREE_RUNNING, PtpWatch
 from capture.record import SIDES, Diagnostic
 from capture.recorder import Recorder
+from capture.service import Service
 from capture.trigger import BoardCount, TriggerLog
 from capture.trigger_run import TriggerRun
 from capture.vitals import Vitals
-from capture.worker import share_interpreter
+from capture.watchdog import IDLE, progress
+from capture.worker import Worker, share_interpreter
 
 CONTROL_PERIOD_S = 0.1
 DIAGNOSTICS_PERIOD_S = 1.0
@@ -112,6 +114,7 @@ class Recording:
         progress: Callable[[str], None],
         companions: Sequence[Companion] = (),
         health: HealthWriter | None = None,
+        service: Service | None = None,
     ) -> None:
         self._disk = disk
         self._loaded = loaded
@@ -120,6 +123,8 @@ class Recording:
         self._progress = progress
         started = datetime.datetime.fromtimestamp(clock.utc_ns() / 1e9, datetime.UTC)
         self.flight = self._config.flight or f"flight_{started:%Y%m%dT%H%M%SZ}"
+        if self._config.flight is None or (service is not None and service.managed):
+            self.flight = free_name(self.flight, (self._config.disks.left, self._config.disks.right))
         self._aux = AuxLog(clock)
         self._triggers = TriggerLog(self._config.trigger.rate_hz)
         self._cameras: dict[Place, tuple[Camera, CameraDescription]] = {}
@@ -130,6 +135,7 @@ class Recording:
         self._gates = Gates(clock)
         own = [companion for companion in (self._ptp, self._analog) if companion is not None]
         self._companions = (*own, *companions, self._gates)
+        self._service = service
         self._failures: list[str] = []
         self._flight_id = f"{self.flight}-{clock.utc_ns():x}"
         places = [(camera.side, camera.name) for camera in self._config.cameras]
@@ -150,6 +156,7 @@ class Recording:
             self._open_cameras(cleanup)
             run = self._make_run()
             cleanup.callback(run.board.close)
+            run.board.placement = self._config.threads.control
             self._make_lanes(run.open())
             self._show_frames()
             started_s = self._clock.monotonic_s()
@@ -231,6 +238,7 @@ class Recording:
             clock=self._clock,
             ring_slots=self._config.ring_slots,
             lock_memory=self._config.ring.lock_memory,
+            threads=self._config.threads,
             calibration=self._calibration(),
             clock_state=self._ptp.now if self._ptp else lambda: FREE_RUNNING,
             trigger_latency_ns=round(self._config.camera.trigger_latency_us * 1e3),
@@ -284,9 +292,11 @@ class Recording:
 
     def _control(self, run: TriggerRun, stop: StopRule, started_s: float) -> None:
         next_report_s = started_s + DIAGNOSTICS_PERIOD_S
+        self._place_threads()
         while not stop.requested.wait(CONTROL_PERIOD_S):
             now_s = self._clock.monotonic_s()
             self._flush_aux()
+            self._look()
             if now_s >= next_report_s:
                 next_report_s += DIAGNOSTICS_PERIOD_S
                 self._report()
@@ -312,7 +322,7 @@ class Recording:
         ):
             self._clock.sleep(0.005)
         for place, grabber in self._grabbers.items():
-            if not grabber.stop(deadline_s=STOP_DEADLINE_S):
+            if not self._end(grabber, STOP_DEADLINE_S):
                 self._failures.append(f"{'/'.join(place)}: its read thread hangs in the camera driver")
             if grabber.error is not None:
                 self._failures.append(str(grabber.error))
@@ -321,7 +331,7 @@ class Recording:
         self._report()
         self._flush_aux()
         for side, recorder in self._recorders.items():
-            if not recorder.stop(deadline_s=FLUSH_DEADLINE_S):
+            if not self._end(recorder, FLUSH_DEADLINE_S):
                 self._failures.append(f"{side}: the disk did not take its last frames in {FLUSH_DEADLINE_S:g} s")
             if recorder.error is not None:
                 self._failures.append(f"{recorder.name}: {recorder.error}")
@@ -343,6 +353,27 @@ class Recording:
                 self._failures.append(f"{'/'.join(place)}: the books do not balance: {account}")
         self._write_metadata()
         return self._result(next_index - self._config.trigger.first_index, seconds, run.board.garbled_lines)
+
+    def _look(self) -> None:
+        if self._service is not None:
+            self._service.look(progress(self._ledger.accounts(), self._lanes.values()))
+
+    def _end(self, worker: Worker, deadline_s: float) -> bool:
+        """Ask a thread to end and wait. Bounded by itself, so the service's watchdog rests."""
+        until_s = self._clock.monotonic_s() + deadline_s
+        while not worker.stop(CONTROL_PERIOD_S):
+            if self._service is not None:
+                self._service.look(IDLE)
+            if self._clock.monotonic_s() > until_s:
+                return False
+        return True
+
+    def _place_threads(self) -> None:
+        """Take the control thread's placement, last of all, and say which thread could not have its own."""
+        refused = {worker.misplaced for worker in (*self._grabbers.values(), *self._recorders.values())}
+        refused.add(self._config.threads.control.take())
+        for problem in refused - {None}:
+            self._progress(f"threads: {problem}")
 
     def _write_metadata(self) -> None:
         writers = [writer for r in self._recorders.values() for writer in (*r.segments, r.aux)]
@@ -383,12 +414,15 @@ class Recording:
         clocks = {"/".join(place): grabber.clock for place, grabber in self._grabbers.items()}
         judge_cameras(self._gates, clocks, self._config.camera.time_sigma_limit_us)
         health = self._vitals.snapshot()
-        statuses = (Diagnostic(n.level, n.name, n.message, tuple(n.values.items())) for n in health.diagnostics)
-        self._aux.diagnostics(tuple(statuses))
+        statuses = tuple(Diagnostic(n.level, n.name, n.message, tuple(n.values.items())) for n in health.diagnostics)
+        self._aux.diagnostics(statuses)
         recorded = sum(camera.recorded for camera in health.cameras)
         lost = sum(camera.lost_total for camera in health.cameras)
         depth = max((camera.ring_in_use for camera in health.cameras), default=0)
-        self._progress(
+        if self._service is not None:
+            self._service.statuses(statuses)
+        totals = self._progress if self._service is None else self._service.totals
+        totals(
             f"triggers {self._triggers_so_far()}  recorded {recorded}  lost {lost}  "
             f"ring {depth}/{self._config.ring_slots}"
         )

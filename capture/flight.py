@@ -30,6 +30,18 @@ def find_folders(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
+def free_name(name: str, disks: Sequence[Path]) -> str:
+    """``name``, or ``name_2``, ``name_3`` … where a flight of that name is on a disk already.
+
+    A clock that was never set gives the same names after every start.
+    """
+    free, number = name, 1
+    while any((disk / free).exists() for disk in disks):
+        number += 1
+        free = f"{name}_{number}"
+    return free
+
+
 def metadata_yaml(segments: Sequence[SegmentWriter]) -> str:
     """The text of ``metadata.yaml`` (rosbag2's, version 5) for the closed segments of one folder."""
     first = min((s.first_log_ns for s in segments if s.first_log_ns), default=0)

@@ -159,6 +159,7 @@ class Grabber(Worker):
         try:
             while not self.stop_requested.is_set():
                 try:
+                    self.turn()
                     self.step(GRAB_TIMEOUT_S)
                     self._take_temperature()
                 except CameraLost as error:

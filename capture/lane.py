@@ -1,11 +1,11 @@
 """A side's lane: its cameras, their rings and read threads, and the write thread of its disk, wired together."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from capture.camera.base import Camera, CameraDescription
-from capture.config import DiskConfig
+from capture.config import DiskConfig, ThreadsConfig
 from capture.disk import Disk
 from capture.grabber import Grabber, ReadParts, SideGate
 from capture.record import frame_topic, image_topic
@@ -23,6 +23,7 @@ class LaneParts(ReadParts):
     provenance: dict[str, str]
     ring_slots: int
     lock_memory: bool
+    threads: ThreadsConfig = field(default_factory=ThreadsConfig)
     calibration: tuple[str, bytes] | None = None  # name and content
 
 
@@ -94,4 +95,7 @@ def make_lane(
         name: Grabber((side, name), camera, description, rings[name], layouts[name], gate, recorder, parts)
         for name, (camera, description) in cameras.items()
     }
+    recorder.placement = parts.threads.write
+    for grabber in grabbers.values():
+        grabber.placement = parts.threads.read
     return Lane(side, recorder, grabbers)

@@ -152,7 +152,7 @@ class Recorder(Worker):
     def work(self) -> None:
         """Write until asked to stop and nothing is left."""
         while self.step(wait_s=0.1) or not self.stop_requested.is_set():
-            pass
+            self.turn()
 
     def step(self, wait_s: float) -> bool:
         """Write one item, when there is one within ``wait_s``."""

@@ -25,6 +25,8 @@ from capture.worker import Worker
 
 REPLY_TIMEOUT_S = 1.0
 RECONNECT_S = 0.25
+WRITE_TIMEOUT_S = 1.0
+BOARD_ANSWER_S = 2 * (WRITE_TIMEOUT_S + REPLY_TIMEOUT_S)  # a question is asked twice
 _PULSES_KEPT = 4096
 _STEPS_KEPT = 64
 
@@ -211,7 +213,7 @@ class TriggerBoard(Worker):
                 self._reopen()
 
     def _open(self) -> serial.Serial:
-        return serial.Serial(self.port, baudrate=115200, timeout=0.1, write_timeout=1.0, exclusive=True)
+        return serial.Serial(self.port, baudrate=115200, timeout=0.1, write_timeout=WRITE_TIMEOUT_S, exclusive=True)
 
     def _reopen(self) -> None:
         while not self.stop_requested.wait(RECONNECT_S):

@@ -25,6 +25,7 @@ WINDOW_S = 10.0  # losses are judged over this
 RATE_WINDOW_S = 2.0
 SILENT_S = 1.0  # a part that has given nothing for so long, while it should have, is silent
 HUNG_DISK_S = 2.0
+HUNG_DRIVER_S = 2.0
 LOSING_SHARE = 0.01  # of a camera's triggers within the window
 RING_BEHIND_SHARE = 0.5
 MINUTES_LOW, MINUTES_LEAST = 10.0, 2.0
@@ -202,6 +203,8 @@ class Vitals:
             return ERROR, str(grabber.error or "its read thread has ended").removeprefix(f"{health.place}: ")
         if grabber.is_absent:
             return ERROR, f"{grabber.absences[-1].cause}; looked for: {grabber.seek_error or 'not yet'}"
+        if grabber.still_s > HUNG_DRIVER_S:
+            return ERROR, f"the camera driver has not answered for {grabber.still_s:.0f} s: unplug and replug it"
         if unanswered > max(3.0, SILENT_S * rate_hz):
             return ERROR, f"no frame on the last {unanswered} triggers: check its cable and its power"
         place = grabber.place

@@ -2,7 +2,10 @@
 
 import sys
 import threading
+import time
 from abc import ABC, abstractmethod
+
+from capture.placement import Placement
 
 GIL_SWITCH_S = 0.0005
 
@@ -19,6 +22,9 @@ class Worker(ABC):
         self.name = name
         self.error: BaseException | None = None
         self.stop_requested = threading.Event()
+        self.placement = Placement()  # the owner may give another before the start
+        self.misplaced: str | None = None  # why the thread could not have its placement
+        self._turned_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     @abstractmethod
@@ -41,8 +47,19 @@ class Worker(ABC):
         """Whether the job is still going on."""
         return self._thread.is_alive()
 
+    def turn(self) -> None:
+        """The job says that it has come round."""
+        self._turned_s = time.monotonic()
+
+    @property
+    def still_s(self) -> float:
+        """For how long the job has not come round. One that hangs does not."""
+        return time.monotonic() - self._turned_s
+
     def _run(self) -> None:
         try:
+            self.misplaced = self.placement.take()
+            self.turn()
             self.work()
         except BaseException as error:  # the owner decides what it means
             self.error = error
