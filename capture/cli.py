@@ -1,5 +1,6 @@
 """`wingcap`: the commands of the recording side."""
 
+import faulthandler
 import shutil
 import signal
 import threading
@@ -59,6 +60,8 @@ def record(
     loaded, clock = load_config(config), SystemClock()
     disks = (loaded.config.disks.left, loaded.config.disks.right)
     service = Service(loaded.config, clock, Journal() if journal_listens() else Narrator(), Notifier())
+    if service.managed:  # the watchdog's SIGABRT then says where each thread stood
+        faulthandler.enable()
     companions = [*make_companions(loaded.config, clock), AfterPower(disks)]
     with sole_recorder(disks), HealthWriter(loaded.config, clock, service.event) as health:
         recording = Recording(loaded, clock, SystemDisk(), service.event, companions, health, service)

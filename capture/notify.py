@@ -37,6 +37,11 @@ class Notifier:
         """The service is ending in good order; the watchdog rests."""
         self._send("STOPPING=1")
 
+    def close(self) -> None:
+        """Say no more."""
+        if self._socket is not None:
+            self._socket.close()
+
     def _send(self, message: str) -> None:
         if self._socket is not None:
             with contextlib.suppress(OSError):  # the manager is busy or gone: the recording is worth more

@@ -1,6 +1,5 @@
 """A recording as the computer's service manager sees it: ready, alive, in a few words, and in the journal."""
 
-import faulthandler
 from collections.abc import Sequence
 
 from capture.clock import Clock
@@ -24,8 +23,6 @@ class Service:
         self._changes = Changes(clock.monotonic_s)
         self._totals_s = float("-inf")  # when the running totals last went to the journal
         self._ready = False
-        if notifier.listening:  # the watchdog's SIGABRT then says where each thread stood
-            faulthandler.enable()
 
     def event(self, text: str) -> None:
         """Something that happened once."""
@@ -64,4 +61,5 @@ class Service:
     def close(self) -> None:
         """The service ends in good order."""
         self._notifier.stopping()
+        self._notifier.close()
         self._voice.close()

@@ -95,7 +95,10 @@ class FakeCamera(Camera):
         if key in self.rig.undelivered:
             return
         for _ in range(1 + (key in self.rig.repeated)):
-            slot, buffer = self._buffers.get()
+            try:
+                slot, buffer = self._buffers.get(timeout=0.1)
+            except queue.Empty:  # its read thread hangs: the driver has nowhere to put the frame
+                return
             buffer[:] = memoryview(pixels_of(self.address, index))
             ready_ns = now_ns + self.settings.exposure_us * 1000 + ROW_TIME_NS * HEIGHT
             status = FrameStatus.INCOMPLETE if key in self.rig.incomplete else FrameStatus.COMPLETE
