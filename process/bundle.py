@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
-from scipy.optimize import least_squares
+from scipy.linalg import null_space, solve
 
 from capture.errors import ProcessError
 from process.camera_model import INTRINSIC_NAMES, distort, pose_matrix
@@ -21,6 +20,8 @@ Array = NDArray[np.float64]
 INTRINSICS = len(INTRINSIC_NAMES)
 TERMS = {2: [4, 5], 5: [4, 5, 6, 7, 8]}  # which of the intrinsics are distortion terms that may move
 MAX_EVALUATIONS = 200
+LEAST_DAMPING, MOST_DAMPING = 1e-12, 1e10
+LEAST_COSINE = 1e-9  # between the residuals and a column of the Jacobian, where the adjustment ends
 WEAK = 1e-10  # squared ratio of the scaled Jacobian's singular values below which a parameter is undetermined
 
 
@@ -86,21 +87,10 @@ def adjust(corners_px: Array, start: Estimate, freedom: Freedom) -> Adjustment:
     freedoms = corners_px.size - space.zero.size
     if freedoms <= 0:
         raise ProcessError("too few corners for this many unknowns; take more views of the board")
-    weight = 1.0 / np.sqrt(corners_px.size)
-    solution = least_squares(
-        lambda x: weight * residuals_of(space.estimate(x), corners_px).ravel(),
-        space.zero,
-        jac=lambda x: weight * space.jacobian(x),
-        method="lm",
-        x_scale="jac",
-        xtol=1e-13,
-        ftol=1e-15,
-        gtol=1e-15,
-        max_nfev=MAX_EVALUATIONS,
-    )
-    estimate = space.estimate(solution.x)
+    x, evaluations = _minimised(space, corners_px)
+    estimate = space.estimate(x)
     residuals = residuals_of(estimate, corners_px)
-    jacobian = space.jacobian(solution.x)
+    jacobian = space.jacobian(x)
     if not np.all(np.isfinite(residuals)):
         raise ProcessError("the adjustment diverged; take more views of the board, tilted in different directions")
     columns = np.linalg.norm(jacobian, axis=0)
@@ -125,8 +115,40 @@ def adjust(corners_px: Array, start: Estimate, freedom: Freedom) -> Adjustment:
         variance * board @ board.T,
         float(np.sqrt(variance)),
         gradient,
-        int(solution.nfev),
+        evaluations,
     )
+
+
+def _minimised(space: "_Space", corners_px: Array) -> tuple[Array, int]:
+    """The x with the least squared residuals, and how often these were computed (Levenberg and Marquardt).
+
+    By the normal equations of columns scaled to one: a fraction of the time of a QR factorisation, and as exact where
+    it ends, since what ends it is the gradient itself.
+    """
+    x, damping = space.zero.copy(), 1e-4
+    residuals = residuals_of(space.estimate(x), corners_px).ravel()
+    for evaluation in range(1, MAX_EVALUATIONS):
+        jacobian = space.jacobian(x)
+        if not np.all(np.isfinite(jacobian)):
+            return x, evaluation
+        columns = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+        scaled = jacobian / columns
+        normal, gradient = scaled.T @ scaled, scaled.T @ residuals
+        while True:
+            damped = normal + damping * np.eye(len(x))
+            step = -np.asarray(solve(damped, gradient, assume_a="pos", check_finite=False)) / columns
+            trial = residuals_of(space.estimate(x + step), corners_px).ravel()
+            if trial @ trial <= residuals @ residuals:
+                break
+            damping *= 10.0
+            if damping > MOST_DAMPING:  # no step is downhill: this is the optimum, to rounding
+                return x, evaluation
+        gain = residuals @ residuals - trial @ trial
+        x, residuals, damping = x + step, trial, max(0.1 * damping, LEAST_DAMPING)
+        length = np.linalg.norm(residuals)
+        if gain <= 1e-15 * length**2 or length < 1e-9 or np.abs(gradient).max() < LEAST_COSINE * length:
+            return x, evaluation
+    return x, MAX_EVALUATIONS
 
 
 class _Space:

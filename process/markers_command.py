@@ -58,6 +58,7 @@ class Triangulation(StrEnum):
     """Choices of ``--triangulation``."""
 
     default = "default"
+    linear = "linear"
     paper = "paper"
 
 
@@ -72,7 +73,8 @@ def markers(
         Matching, typer.Option(help="Epipolar geometry and the wing's layout, or the paper's sorting by rows.")
     ] = Matching.default,
     triangulation: Annotated[
-        Triangulation, typer.Option(help="Least reprojection error, or the paper's matrix Q.")
+        Triangulation,
+        typer.Option(help="Least reprojection error, least algebraic one (MATLAB's), or the paper's matrix Q."),
     ] = Triangulation.default,
     dbc: DbcOption = None,
     max_gap: MaxGapOption = MAX_GAP_S,

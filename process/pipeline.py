@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +25,7 @@ from process.match import UNSEEN, Matches, MatchSettings, Track, match
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
 from process.set_time import marker_instants_ns, ptp_state, set_instant_ns, time_sigma_ns
 from process.tables import MARKER_SCHEMA
-from process.triangulate import triangulate_as
+from process.triangulate import Method, triangulate_as
 from process.workers import Shared, crew, usable_cores
 
 BLOCK_TRIGGERS = 50
@@ -39,7 +39,7 @@ class PipelineSettings:
 
     detection: DetectSettings = field(default_factory=DetectSettings)
     matching: MatchSettings = field(default_factory=MatchSettings)
-    triangulation: Literal["default", "paper"] = "default"
+    triangulation: Method = "default"
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ Points are worked out in ideal normalised coordinates (X/Z, Y/Z), to which pixel
 lens model; over a centroid's error of some 0.01 px the lens is linear.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from process.camera_model import CameraModel, RigSide, StereoPair
 
 Array = NDArray[np.float64]
-Method = Literal["default", "paper"]
+Method = Literal["default", "linear", "paper"]
 
 GAUSS_NEWTON_STEPS = 3
 """From a linear start a centroid's error away from the optimum each step squares what is left: 2 are enough."""
@@ -66,8 +66,9 @@ def triangulate(
 ) -> Points:
     """Points of N matched centroids (N, 2) with covariances (N, 2, 2).
 
-    ``default``: least squares of the reprojection error in both cameras, each weighted by its covariance. ``paper``:
-    eqs. 4 to 6 on rectified pixels (errata: Q's last row has −1/T_x), the row taken from cam0.
+    ``default``: least squares of the reprojection error in both cameras, each weighted by its covariance. ``linear``:
+    least algebraic error (Hartley & Zisserman, section 12.2), as MATLAB's ``triangulate`` has it. ``paper``: eqs. 4 to
+    6 on rectified pixels (errata: Q's last row has −1/T_x), the row taken from cam0.
     """
     rays0 = rays(side.pair.cam0, pixels0, covariance0_px2)
     rays1 = rays(side.pair.cam1, pixels1, covariance1_px2)
@@ -77,7 +78,9 @@ def triangulate(
 def triangulate_as(method: Method, side: RigSide, rays0: Rays, rays1: Rays) -> Points:
     """``triangulate`` of what is through the lens already."""
     if method == "paper":
-        return _triangulate_paper(side, rays0, rays1)
+        return _in_one_go(side, rays0, rays1, lambda xy0, xy1: _by_q(side.pair, xy0, xy1))
+    if method == "linear":
+        return _in_one_go(side, rays0, rays1, lambda xy0, xy1: _by_least_algebraic(side.pair, xy0, xy1))
     return triangulate_rays(side, rays0, rays1)
 
 
@@ -126,14 +129,30 @@ def rectified_pixels(pair: StereoPair, camera: Literal[0, 1], xy: Array) -> Arra
     return np.asarray(projected[:, :2] / projected[:, 2:])
 
 
-def _triangulate_paper(side: RigSide, rays0: Rays, rays1: Rays) -> Points:
-    def points_of(xy0: Array, xy1: Array) -> Array:
-        left, right = rectified_pixels(side.pair, 0, xy0), rectified_pixels(side.pair, 1, xy1)
-        disparity = left[:, 0] - right[:, 0]
-        stacked = np.stack([left[:, 0], left[:, 1], disparity, np.ones(len(left))], axis=1)  # eq. 5
-        homogeneous = stacked @ side.pair.rectification.Q.T
-        return np.asarray((homogeneous[:, :3] / homogeneous[:, 3:]) @ side.pair.rectification.R0)  # eq. 6, then cam0
+def _by_q(pair: StereoPair, xy0: Array, xy1: Array) -> Array:
+    left, right = rectified_pixels(pair, 0, xy0), rectified_pixels(pair, 1, xy1)
+    disparity = left[:, 0] - right[:, 0]
+    stacked = np.stack([left[:, 0], left[:, 1], disparity, np.ones(len(left))], axis=1)  # eq. 5
+    homogeneous = stacked @ pair.rectification.Q.T
+    return np.asarray((homogeneous[:, :3] / homogeneous[:, 3:]) @ pair.rectification.R0)  # eq. 6, then cam0
 
+
+def _by_least_algebraic(pair: StereoPair, xy0: Array, xy1: Array) -> Array:
+    """Pixels and millimetres, as MATLAB has them: the result depends on the units by parts of a micrometre."""
+    rows = []
+    for xy, camera, T in ((xy0, pair.cam0, np.eye(4)), (xy1, pair.cam1, pair.T_cam1_cam0)):
+        P = camera.K @ np.column_stack([T[:3, :3], 1000.0 * T[:3, 3]])
+        pixels = xy @ camera.K[:2, :2].T + camera.K[:2, 2]
+        rows += [pixels[:, axis, None] * P[2] - P[axis] for axis in (0, 1)]
+    system = np.stack(rows, axis=1)
+    finite = _finite(system)
+    homogeneous = np.full((len(xy0), 4), np.nan)
+    homogeneous[finite] = np.linalg.svd(system[finite])[2][:, -1]
+    return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:] / 1000.0)
+
+
+def _in_one_go(side: RigSide, rays0: Rays, rays1: Rays, points_of: Callable[[Array, Array], Array]) -> Points:
+    """Points in cam0's frame by a formula, the covariances taken through its derivatives."""
     R, t = side.pair.T_cam1_cam0[:3, :3], side.pair.T_cam1_cam0[:3, 3]
     with np.errstate(all="ignore"):
         points = points_of(rays0.xy, rays1.xy)

@@ -25,7 +25,7 @@ def parallel() -> RigSide:
     return RigSide(StereoPair(camera, camera, T_cam1_cam0), np.eye(4), "a", "b", 1e4)
 
 
-@pytest.mark.parametrize("method", ["default", "paper"])
+@pytest.mark.parametrize("method", ["default", "linear", "paper"])
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_exact_pixels_give_the_exact_points(world, side, method):
     points_m = world.markers_m(side, 0.15, 0.1)
@@ -37,7 +37,7 @@ def test_exact_pixels_give_the_exact_points(world, side, method):
     assert set(found.reasons) == {""}
 
 
-@pytest.mark.parametrize("method", ["default", "paper"])
+@pytest.mark.parametrize("method", ["default", "linear", "paper"])
 def test_parallel_cameras_closed_form(parallel, method):
     """Z = f B / d, and σ_Z = Z²/(f B) σ_d with σ_d = √2 σ."""
     pixels0 = np.array([[1100.0, 800.0], [950.0, 700.0]])
@@ -74,7 +74,7 @@ def test_it_is_the_least_reprojection_error(world):
         np.testing.assert_allclose(np.linalg.inv(best.jac.T @ best.jac), found.covariance_m2[k], rtol=0.01, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["default", "paper"])
+@pytest.mark.parametrize("method", ["default", "linear", "paper"])
 def test_covariance_is_that_of_many_trials(world, method):
     """Mean normalised squared error: χ² of 3·n degrees of freedom, two-sided 1e-4."""
     rng = np.random.default_rng(7)
@@ -103,7 +103,7 @@ def test_the_optimum_is_never_worse_than_the_paper(world):
 def test_what_cannot_be_is_nan_with_a_reason(parallel):
     pixels0 = np.array([[1000.0, 750.0], [1000.0, 750.0], [1000.0, 750.0], [np.nan, 750.0]])
     pixels1 = np.array([[1000.0, 750.0], [1100.0, 750.0], [900.0, 750.0], [900.0, 750.0]])
-    for method in ("default", "paper"):
+    for method in ("default", "linear", "paper"):
         found = triangulate(parallel, pixels0, pixels1, covariances(4), covariances(4), method)
         assert found.reasons == ("parallel", "behind", "", "outside_lens")
         assert np.isnan(found.xyz_m[[0, 1, 3]]).all()

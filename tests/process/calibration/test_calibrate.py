@@ -14,9 +14,10 @@ from process.board import Board
 from process.bundle import Estimate, Freedom, _Space, adjust
 from process.calibrate import CalibrationSettings, Method, calibrate, calibration_covariance_m2
 from process.calibration_session import image_pairs
-from process.camera_model import CameraModel, StereoPair, pose_matrix, read_pair
+from process.camera_model import CameraModel, RigSide, StereoPair, pose_matrix, read_pair
 from process.cli import app
 from process.pose_fit import triangulate_midpoint
+from process.triangulate import triangulate
 
 BOARD = Board(10, 7, 0.03)
 SIZE = (2080, 1552)
@@ -236,6 +237,29 @@ def test_matlabs_standard_errors_are_reproduced(duodic_calibration):
     np.testing.assert_allclose(1000 * sigma[21:], [0.0838, 0.0285, 0.3094], rtol=0.02)
     np.testing.assert_allclose(1000 * sigma[18:21], [0.78, 0.73, 0.15], rtol=0.03)  # published to two digits
     assert sigma[0] == pytest.approx(4.875, rel=0.02)
+
+
+@pytest.mark.slow
+def test_matlabs_points_are_reproduced(duodic):
+    """Twenty frames of 435 points, triangulated with MATLAB's own parameters."""
+    width, height = (int(value) for value in duodic["image_size_hw"].ravel()[::-1])
+    cameras = [
+        CameraModel(width, height, duodic[f"K{k}"], np.concatenate([duodic[f"D{k}"].ravel(), np.zeros(5)])[:5])
+        for k in (1, 2)
+    ]
+    T_cam1_cam0 = np.eye(4)
+    T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3] = duodic["R12_matlab_rowvec"].T, duodic["T12"].ravel() / 1000.0
+    side = RigSide(StereoPair(*cameras, T_cam1_cam0), np.eye(4), "", "", 0.0)
+    worst_m = {"linear": 0.0, "default": 0.0}
+    seen = duodic["uni_points2d"].reshape(2, 20, -1, 2).transpose(1, 0, 2, 3)  # all frames of cam0, then of cam1
+    for pixels, points in zip(seen, duodic["uni_points3d"], strict=True):
+        tracked = np.isfinite(points).all(axis=1)
+        eye = np.broadcast_to(np.eye(2), (tracked.sum(), 2, 2))
+        for method, known in worst_m.items():
+            found = triangulate(side, *pixels[:, tracked], eye, eye, method).xyz_m
+            worst_m[method] = max(known, np.abs(found - points[tracked] / 1000.0).max())
+    assert worst_m["linear"] < 2e-7
+    assert worst_m["default"] < 3e-6  # another optimum: rays that pass each other by up to 1.4 px
 
 
 def test_a_bundle_whose_views_do_not_determine_it_says_so():
