@@ -32,7 +32,7 @@ class Assembled:
 
     frames: pa.Table
     tallies: Mapping[str, Sequence[Mapping[str, float]]]  # by side, of each part
-    reference: str  # what displacements are counted from
+    wings: pa.Table  # unloaded.parquet
 
 
 def assemble(store: PartStore, measured: Sequence[Key], fitted: Sequence[Key], target: Target) -> Assembled:
@@ -59,7 +59,7 @@ def assemble(store: PartStore, measured: Sequence[Key], fitted: Sequence[Key], t
     with TableWriter(target.out / UNLOADED, wings.schema, target.note) as writer:
         writer.append(wings)
     _write_markers(store, measured, target)
-    return Assembled(pa.concat_tables(frames), tallies, wings.column("reference")[0].as_py())
+    return Assembled(pa.concat_tables(frames), tallies, wings)
 
 
 def _write_markers(store: PartStore, measured: Sequence[Key], target: Target) -> None:

@@ -8,15 +8,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from reconstruct.equilibrium import solve
 from reconstruct.loads_file import LoadsFile, loads_on
-from reconstruct.reference import ReferenceShape
+from reconstruct.reference import UNLOADED_WING
 from reconstruct.rotation import Array
-from reconstruct.shared import sigma_of
-from reconstruct.wing import HalfWing
+from reconstruct.tables import REFERENCE_POSITION
+from reconstruct.wing import HalfWing, Wing
 
 LEAST_HANG_SIGMAS = 3.0  # what hangs by less than this many sigmas says nothing of stiffness
+DOUBTFUL_SIGMAS = 2.0  # a misfit that readers are warned of
 _ROUNDS = 8  # of Newton's method for the stiffness
 _STEP = 1e-3  # of it, relative
 _STIFFEST = -0.9
@@ -62,9 +64,12 @@ class Hang:
         )
 
 
-def hang(half: HalfWing, at_rest: ReferenceShape) -> Hang | None:
-    """What a shape at rest (a recorded one) says; None when the wing file has no masses, or they move the tip too
-    little to be told from the shape's own error, or the model under weight has no equilibrium."""
+def hang(half: HalfWing, tip_m: Array, sigma_tip_m: Array) -> Hang | None:
+    """What a tip at rest says, recorded at ``tip_m`` (3,), body frame, with one sigma (3,) an axis.
+
+    None when the wing file has no masses, or they move the tip too little to be told from the tip's own error, or the
+    model under weight has no equilibrium.
+    """
     if not np.sum(half.mass_kg) > 0:
         return None
     model = _tip_m(half, 0.0)
@@ -73,10 +78,8 @@ def hang(half: HalfWing, at_rest: ReferenceShape) -> Hang | None:
     way = model - half.rest_position_m[-1]
     model_m = float(np.linalg.norm(way))
     direction = way / max(model_m, 1e-12)
-    measured_m = float(direction @ (at_rest.xyz_m[-1] - half.rest_position_m[-1]))
-    # the unloaded wing was not seen by the cameras: the whole of what frames share is in the difference
-    shared = 0.0 if at_rest.shared is None else float(sigma_of(direction @ at_rest.shared[-1, :3]))
-    sigma_m = float(np.hypot(shared, np.linalg.norm(direction * at_rest.sigma[-1, :3])))
+    measured_m = float(direction @ (tip_m - half.rest_position_m[-1]))
+    sigma_m = float(np.linalg.norm(direction * sigma_tip_m))
     if model_m < LEAST_HANG_SIGMAS * sigma_m or model_m == 0.0:
         return None
     softer, slope_m = 0.0, model_m
@@ -98,6 +101,17 @@ def hang(half: HalfWing, at_rest: ReferenceShape) -> Hang | None:
         sigma_m / abs(slope_m),
         float(half.stiffness_sigma[_OUT_OF_PLANE]),
     )
+
+
+def recorded_hangs(wing: Wing, wings: pa.Table) -> list[Hang]:
+    """Of the wings whose displacements are counted from a recorded shape; ``wings`` is unloaded.parquet."""
+    found = []
+    for row in wings.to_pylist():
+        half = wing.left if row["side"] == "left" else wing.right
+        if row["reference"] != UNLOADED_WING and row["station"] == len(half.node_s_m) - 1:
+            tip, sigma = (np.array([row[prefix + name] for name in REFERENCE_POSITION]) for prefix in ("", "sigma_"))
+            found.append(hang(half, tip, sigma))
+    return [one for one in found if one is not None]
 
 
 def _tip_m(half: HalfWing, softer: float) -> Array | None:

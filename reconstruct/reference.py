@@ -32,6 +32,12 @@ class ReferenceShape:
     sigma: Array  # (N + 1, 4) one sigma of nodes (m) and twist (rad) that displacements from it have from it
     shared: Array | None  # (N + 1, 4, P) its answer to the errors that all frames share; None: it has not that of ours
 
+    @property
+    def sigma_position_m(self) -> Array:
+        """(N + 1, 3) one sigma of where it is: its own, and what all frames share."""
+        own = self.sigma[:, :3]
+        return own if self.shared is None else np.hypot(own, sigma_of(self.shared)[:, :3])
+
 
 def unloaded(half: HalfWing) -> ReferenceShape:
     """The wing file's wing without loads: exact by definition."""

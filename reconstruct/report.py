@@ -202,7 +202,7 @@ def _head(result: Result) -> str:
             ("sigma of the tip's twist, median", "sigma_tip_twist_deg", "°"),
         )
     ]
-    parts.append(_table(columns, [*rows, *_stiffness_rows(summary)]))
+    parts.append(_table(columns, [*rows, *_stiffness_rows(summary), *_rest_rows(summary)]))
     return "".join(parts)
 
 
@@ -218,6 +218,19 @@ def _stiffness_rows(summary: Any) -> list[tuple[str, ...]]:
         if any(cell != "–" for cell in cells):
             rows.append((f"{key} found, against the wing file", *cells))
     return rows
+
+
+def _rest_rows(summary: Any) -> list[tuple[str, ...]]:
+    """What the recorded shape at rest says of the wing's stiffness."""
+    found = summary.get("at_rest", {})
+    if not found:
+        return []
+    cells = []
+    for side in summary["sides"]:
+        here = found.get(side)
+        sigma = here and _number(here["sigma_softer_percent"], "%")
+        cells.append(f"{_number(here['softer_percent'], '%', sign=True)} ± {sigma}" if here else "–")
+    return [("softer at rest, under its weight, than the wing file", *cells)]
 
 
 def _compared_head(comparison: Any) -> str:

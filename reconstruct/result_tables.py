@@ -136,6 +136,7 @@ def unloaded_table(fits: SideFits) -> pa.Table:
             **_flat(POSITION, fits.unloaded_xyz_m),
             **_flat(REFERENCE_POSITION, fits.reference_xyz_m),
             "reference_twist_deg": np.degrees(fits.reference_twist_rad),
+            **_flat([f"sigma_{name}" for name in REFERENCE_POSITION], fits.reference_sigma_m),
             "reference": _text([fits.reference] * fits.s_m.size),
         }
     )

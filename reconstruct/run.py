@@ -25,6 +25,7 @@ from process.tables import MARKER_SCHEMA, write_table
 from process.workers import Crew, crew, usable_cores
 from reconstruct.assemble import Target, assemble
 from reconstruct.compare import Comparison, compare
+from reconstruct.hang import DOUBTFUL_SIGMAS, recorded_hangs
 from reconstruct.identify import identify
 from reconstruct.iteration import FEWEST_MARKERS
 from reconstruct.reference import Reference
@@ -118,13 +119,18 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
         _remove_stale(job)
         found = assemble(store, measured, fitted, Target(job.out, job.csv, note, source.rig))
         clock.written = time.monotonic()
+    hangs = recorded_hangs(wing, found.wings)
     summary = {
         "version": version("wingshape"),
         "wing": wing.name,
         **summarise(found.tallies, found.frames),
-        "reference": found.reference,
+        "reference": found.wings.column("reference")[0].as_py(),
+        "at_rest": {one.side: one.as_dict() for one in hangs},
         "smoothed_s": job.smooth_s,
-        "warnings": _warnings(wing, sampled(fitted, wing, store, source.name)),
+        "warnings": [
+            *_warnings(wing, sampled(fitted, wing, store, source.name)),
+            *(one.sentence() for one in hangs if abs(one.misfit) > DOUBTFUL_SIGMAS),
+        ],
         **holes(found.frames),
         **_timing(clock, found.frames, resumed),
         "peak_mb": memory.peak_bytes / 1e6,

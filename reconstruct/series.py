@@ -42,7 +42,8 @@ class SideFits:
     unloaded_xyz_m: Floats  # (N + 1, 3) body frame
     reference: str  # what displacements are counted from,
     reference_xyz_m: Floats  # (N + 1, 3) where that is, body frame,
-    reference_twist_rad: Floats  # (N + 1,) and its twist against the unloaded wing
+    reference_twist_rad: Floats  # (N + 1,) and its twist against the unloaded wing,
+    reference_sigma_m: Floats  # (N + 1, 3) one sigma of where it is, with the errors that all frames share
     xyz_m: Floats  # (F, N + 1, 3) body frame
     sigma_xyz_m: Floats  # (F, N + 1, 3) one sigma, of noise and of the errors that all frames share,
     noise_sigma_xyz_m: Floats  # (F, N + 1, 3) of which this is the noise, which is new in every set
@@ -80,7 +81,7 @@ class SideFits:
 
 
 _OF_THE_WING = {"side", "s_m", "unloaded_xyz_m", "reference", "reference_xyz_m", "reference_twist_rad"}
-_OF_THE_WING |= {"markers", "load_s_m", "smoothed_s"}
+_OF_THE_WING |= {"reference_sigma_m", "markers", "load_s_m", "smoothed_s"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -432,6 +433,7 @@ def _gather(how: FitHow, series: MarkerSeries, points: Ints, rows: _Rows) -> Sid
         reference=reference.name,
         reference_xyz_m=reference.xyz_m,
         reference_twist_rad=reference.twist_rad,
+        reference_sigma_m=reference.sigma_position_m,
         markers=series,
         points=points,
         load_s_m=np.array(how.settings.load_stations_m),
