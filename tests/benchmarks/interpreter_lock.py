@@ -13,7 +13,8 @@ import threading
 import time
 from pathlib import Path
 
-from capture.bench import BenchCase, BoundedDisk, run_case
+from capture.bench import BoundedDisk, run_case
+from capture.bench_rig import BenchCase
 
 PAUSE_S = 0.0005
 

@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from capture.bench import BenchCase, BoundedDisk, bench_cases, bench_target, run_case
+from capture.bench import BoundedDisk, bench_cases, bench_target, run_case
+from capture.bench_rig import BenchCase
 from capture.errors import UsageError
 
 
