@@ -154,8 +154,9 @@ def _record(steps: Steps, hidden: Path, world: World, triggers: int) -> None:
 
 def _measure(steps: Steps) -> None:
     steps.run(
-        "wingproc", "markers", "ssd_left/demo", "ssd_right/demo", "--rig", "ground/rig.json", "-o", "markers.parquet"
-    )
+        "wingproc", "markers", "ssd_left/demo", "ssd_right/demo", "--rig", "ground/rig.json",
+        "--dbc", "ground/aircraft.dbc", "-o", "markers.parquet",
+    )  # fmt: skip
     steps.run(
         "reconstruct", "run", "--markers", "markers.parquet", "--rig", "ground/rig.json", "--wing", "ground/wing.toml",
         "-o", "result",

@@ -25,18 +25,12 @@ from process.pipeline import MarkersResult, PipelineSettings
 from process.pipeline import markers as run_pipeline
 from process.recording import open_recording
 from process.shared_error import with_rig
+from process.signal_options import DbcOption, MaxGapOption
 from process.signal_table import MAX_GAP_S, sets_of, signal_table, signals_path
 from process.signals import read_signals
 from process.tables import write_table
 
 SHOWN_PROBLEMS = 20
-
-DbcOption = Annotated[
-    list[Path] | None, typer.Option(help="DBC file that names the signals in the recorded CAN frames; can be repeated.")
-]
-MaxGapOption = Annotated[
-    float, typer.Option(min=0.0, help="Longest gap between samples, in seconds, that signals are interpolated over.")
-]
 
 
 class Detection(StrEnum):

@@ -12,6 +12,7 @@ from process.camera_model import Rig
 from process.parts import PartStore
 from process.shared_error import with_rig
 from process.tables import TableWriter
+from reconstruct.beside import Beside
 from reconstruct.stages import Key
 from reconstruct.tables import FRAMES, MARKERS, UNLOADED
 
@@ -24,6 +25,7 @@ class Target:
     csv: bool
     note: Mapping[str, Any]  # how they were made
     rig: Rig | None  # of the markers; None when they were given, and say themselves how they were made
+    beside: Beside | None = None  # what was recorded beside the frames
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ def assemble(store: PartStore, measured: Sequence[Key], fitted: Sequence[Key], t
             tables = dict(part.tables)
             unloaded[key.side] = tables.pop(UNLOADED)  # the same in all parts of a side
             tallies.setdefault(key.side, []).append(part.note)
+            if target.beside is not None:
+                tables[FRAMES] = target.beside.joined(tables[FRAMES])
             frames.append(tables[FRAMES])
             for name, table in tables.items():
                 if name not in writers:

@@ -11,7 +11,6 @@ from process.signal_table import GAP, GATES, KEYS, MAX_GAP_S, MISSING, signal_ta
 from process.signals import Signals, read_signals
 from reconstruct.tables import read_table
 
-
 _NOT_THERE = "the set is not in the table of signals"
 
 

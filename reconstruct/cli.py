@@ -18,6 +18,8 @@ from typer.core import TyperGroup
 from capture.console import note, run, say, say_json
 from capture.errors import UsageError
 from process.reference import parse_window
+from process.signal_options import DbcOption, MaxGapOption
+from process.signal_table import MAX_GAP_S
 from reconstruct.import_wing import import_wing
 from reconstruct.plan import plan
 from reconstruct.report import write_report
@@ -70,6 +72,8 @@ def run_command(
     reference_window: Annotated[
         str | None, typer.Option(help="Count displacements from the mean of these seconds of this recording, A:B.")
     ] = None,
+    dbc: DbcOption = None,
+    max_gap: MaxGapOption = MAX_GAP_S,
     csv: Annotated[bool, typer.Option(help="Write the tables as CSV too.")] = True,
     report: Annotated[bool, typer.Option(help="Draw the report; `reconstruct report` can do so later.")] = True,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
@@ -87,7 +91,15 @@ def run_command(
     if reference is not None and reference_window is not None:
         raise UsageError("give --reference or --reference-window, not both")
     at_rest = parse_window(reference_window, "--reference-window") if reference_window is not None else reference
-    job = Job(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest, report, scheduler)
+    if dbc and table is not None:
+        raise UsageError(
+            "--dbc is for a flight: a marker table has its signals beside it, from `wingproc markers --dbc`"
+        )
+    job = Job(
+        *(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest, report, scheduler),
+        dbc=tuple(dbc or ()),
+        max_gap_s=max_gap,
+    )
     with _progress() as progress:
         summary, warnings = run_job(job, progress)
     if json:

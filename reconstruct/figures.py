@@ -12,7 +12,7 @@ from reconstruct.tables import Floats, Ints, rms
 
 COLOURS = {"left": "#2a6496", "right": "#b5502a"}
 INSTANT_COLOURS = ("#54709e", "#3d3d3d", "#b5502a")
-GREY = "#a9adb2"
+GREY, DARK = "#a9adb2", "#3d3d3d"
 STYLE: dict[str, Any] = {
     "font.size": 9,
     "axes.titlesize": 9.5,
@@ -55,7 +55,7 @@ def wing_3d(result: Result) -> Figure:
     for (name, triggers), colour in zip(chosen_sets(result).items(), INSTANT_COLOURS, strict=False):
         for side in result.sides.values():
             rows = np.flatnonzero(side.shape.trigger_index == triggers[side.shape.side])
-            label = f"{name}, {_seconds(result, side)[rows[0]]:.2f} s" if side is _first(result) else None
+            label = f"{name}, {seconds(result, side)[rows[0]]:.2f} s" if side is _first(result) else None
             axes.plot(*side.shape.xyz_m[rows[0]].T, color=colour, linewidth=1.8, label=label)
             _ribs(axes, side, int(triggers[side.shape.side]), colour)
     _equal_box(axes, result)
@@ -67,13 +67,13 @@ def wing_3d(result: Result) -> Figure:
 
 def is_long(result: Result) -> bool:
     """Whether single oscillations can no longer be told apart in a figure of the whole flight."""
-    return bool(np.ptp(np.concatenate([_seconds(result, side) for side in result.sides.values()])) > DETAIL_S)
+    return bool(np.ptp(np.concatenate([seconds(result, side) for side in result.sides.values()])) > DETAIL_S)
 
 
 def tip(result: Result) -> Figure:
     """Displacement of the tip and its twist in time, with bands of two sigma; of a long flight around its highest."""
     first = _first(result)
-    start = _seconds(result, first)[np.nanargmax(first.frames["tip_dz_m"])] - DETAIL_S / 2
+    start = seconds(result, first)[np.nanargmax(first.frames["tip_dz_m"])] - DETAIL_S / 2
     return _tip(result, (start, start + DETAIL_S) if is_long(result) else (-np.inf, np.inf))
 
 
@@ -83,9 +83,9 @@ def tip_whole(result: Result) -> Figure:
 
 
 def _tip(result: Result, between_s: tuple[float, float]) -> Figure:
-    figure, axes = _panels(3, 1, 5.6)
+    figure, axes = panels(3, 1, 5.6)
     for name, side in result.sides.items():
-        time = _seconds(result, side)
+        time = seconds(result, side)
         time = np.where((time >= between_s[0]) & (time <= between_s[1]), time, np.nan)
         for axis, (value, scale) in zip(
             axes, (("tip_dz_m", 1e3), ("tip_dx_m", 1e3), ("tip_twist_deg", 1.0)), strict=True
@@ -93,8 +93,8 @@ def _tip(result: Result, between_s: tuple[float, float]) -> Figure:
             _band(axis, time, scale * side.frames[value], scale * side.frames[f"sigma_{value}"], name)
     axes[0].set(title=f"Tip displacement from the {result.reference}, up", ylabel="mm")
     axes[1].set(title=f"Tip displacement from the {result.reference}, aft", ylabel="mm")
-    axes[2].set(title="Tip twist, nose-up", ylabel="deg", xlabel=_time_label(result))
-    _legend(axes[0])
+    axes[2].set(title="Tip twist, nose-up", ylabel="deg", xlabel=time_label(result))
+    legend(axes[0])
     return figure
 
 
@@ -124,7 +124,7 @@ def span(result: Result) -> Figure:
 
 def sigmas(result: Result) -> Figure:
     """What the fit states of its own uncertainty, along the span (median over all sets)."""
-    figure, axes = _panels(1, 2, 2.7, sharex=False)
+    figure, axes = panels(1, 2, 2.7, sharex=False)
     for name, side in result.sides.items():
         fitted = np.isfinite(side.shape.xyz_m).all(axis=(1, 2))
         if not fitted.any():
@@ -140,15 +140,15 @@ def sigmas(result: Result) -> Figure:
 
 def residuals_in_time(result: Result) -> Figure:
     """RMS distance between measured and fitted markers, and χ² a degree of freedom, set by set."""
-    figure, axes = _panels(2, 1, 3.7)
+    figure, axes = panels(2, 1, 3.7)
     for name, side in result.sides.items():
-        time = _seconds(result, side)
-        _curve(axes[0], time, side.frames["residual_rms_mm"], name)
-        _curve(axes[1], time, side.frames["chi2_per_dof"], name)
+        time = seconds(result, side)
+        curve(axes[0], time, side.frames["residual_rms_mm"], name)
+        curve(axes[1], time, side.frames["chi2_per_dof"], name)
     axes[1].axhline(1.0, color=GREY, linewidth=1.0, linestyle="--")
     axes[0].set(title="Residual of the markers (RMS of the set)", ylabel="mm", ylim=(0, None))
-    axes[1].set(title="χ² a degree of freedom (1: as the stated noise)", xlabel=_time_label(result), ylim=(0, None))
-    _legend(axes[0])
+    axes[1].set(title="χ² a degree of freedom (1: as the stated noise)", xlabel=time_label(result), ylim=(0, None))
+    legend(axes[0])
     return figure
 
 
@@ -167,37 +167,37 @@ def markers_seen(result: Result) -> Figure:
 
 def loads(result: Result) -> Figure:
     """Sum of the fitted loads and their moment at the root, in time."""
-    figure, axes = _panels(2, 1, 3.7)
+    figure, axes = panels(2, 1, 3.7)
     for name, side in result.sides.items():
-        time = _seconds(result, side)
+        time = seconds(result, side)
         _band(axes[0], time, side.frames["net_fz_n"], side.frames["sigma_net_fz_n"], name)
         tip_up = 1.0 if name == "right" else -1.0
         _band(axes[1], time, tip_up * side.frames["net_mx_nm"], side.frames["sigma_net_mx_nm"], name)
     axes[0].set(title="Sum of the fitted forces, up", ylabel="N")
-    axes[1].set(title="Their bending moment at the root, tip up", ylabel="N·m", xlabel=_time_label(result))
-    _legend(axes[0])
+    axes[1].set(title="Their bending moment at the root, tip up", ylabel="N·m", xlabel=time_label(result))
+    legend(axes[0])
     return figure
 
 
 def error_in_time(result: Result) -> Figure:
     """Error of shape, tip and twist against the reference, set by set."""
-    figure, axes = _panels(3, 1, 5.2)
+    figure, axes = panels(3, 1, 5.2)
     for name, errors in result.errors.items():
         time = np.asarray((errors.timestamp_ns - result.start_ns) * 1e-9, dtype=np.float64)
         distance = 1e3 * np.linalg.norm(errors.shape_m, axis=-1)
-        _curve(axes[0], time, rms(distance, axis=1), name)
-        _curve(axes[1], time, distance[:, -1], name)
-        _curve(axes[2], time, rms(errors.twist_deg, axis=1), name)
+        curve(axes[0], time, rms(distance, axis=1), name)
+        curve(axes[1], time, distance[:, -1], name)
+        curve(axes[2], time, rms(errors.twist_deg, axis=1), name)
     axes[0].set(title="Shape error (RMS over the stations)", ylabel="mm", ylim=(0, None))
     axes[1].set(title="Tip error (3-D distance)", ylabel="mm", ylim=(0, None))
-    axes[2].set(title="Twist error (RMS over the stations)", ylabel="deg", ylim=(0, None), xlabel=_time_label(result))
-    _legend(axes[0])
+    axes[2].set(title="Twist error (RMS over the stations)", ylabel="deg", ylim=(0, None), xlabel=time_label(result))
+    legend(axes[0])
     return figure
 
 
 def error_along_span(result: Result) -> Figure:
     """RMS error along the span (solid) beside the sigma that the fit states (dashed)."""
-    figure, axes = _panels(1, 2, 2.9, sharex=False)
+    figure, axes = panels(1, 2, 2.9, sharex=False)
     for name, errors in result.errors.items():
         shape = result.sides[name].shape
         known = np.isfinite(errors.shape_m).all(axis=-1)
@@ -293,24 +293,25 @@ def _first(result: Result) -> SideResult:
     return max(result.sides.values(), key=lambda side: int(np.isfinite(side.frames["tip_dz_m"]).sum()))
 
 
-def _seconds(result: Result, side: SideResult) -> Floats:
+def seconds(result: Result, side: SideResult) -> Floats:
     return np.asarray((side.shape.timestamp_ns - result.start_ns) * 1e-9, dtype=np.float64)
 
 
-def _time_label(result: Result) -> str:
+def time_label(result: Result) -> str:
     start = np.datetime64(result.start_ns, "ns").astype("datetime64[ms]")
     return f"s since {str(start).replace('T', ' ')} UTC"
 
 
-def _panels(rows: int, columns: int, height_in: float, *, sharex: bool = True) -> tuple[Figure, Any]:
+def panels(rows: int, columns: int, height_in: float, *, sharex: bool = True) -> tuple[Figure, Any]:
     figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
     return figure, figure.subplots(rows, columns, sharex=sharex)
 
 
-def _curve(axis: Axes, time: Floats, value: Floats, side: str) -> None:
-    """A line, or of more sets than can be drawn apart the mean and the range of neighbours."""
+def curve(axis: Axes, time: Floats, value: Floats, side: str) -> None:
+    """A line, or of more sets than can be drawn apart the mean and the range of neighbours; ``side`` may be neither."""
+    colour = COLOURS.get(side, DARK)
     if time.size <= DRAWN_SETS:
-        axis.plot(time, value, color=COLOURS[side], label=side, linewidth=1.0)
+        axis.plot(time, value, color=colour, label=side, linewidth=1.0)
         return
     chunk = -(-time.size // DRAWN_SETS)
     padded = np.full((2, chunk * DRAWN_SETS), np.nan)
@@ -319,21 +320,21 @@ def _curve(axis: Axes, time: Floats, value: Floats, side: str) -> None:
     known = np.isfinite(values).any(axis=1)
     centre, values = np.nanmean(when[known], axis=1), values[known]
     low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
-    axis.fill_between(centre, low, high, color=COLOURS[side], alpha=0.3, linewidth=0)
-    axis.plot(centre, np.nanmean(values, axis=1), color=COLOURS[side], label=side, linewidth=1.0)
+    axis.fill_between(centre, low, high, color=colour, alpha=0.3, linewidth=0)
+    axis.plot(centre, np.nanmean(values, axis=1), color=colour, label=side, linewidth=1.0)
 
 
 def _band(axis: Axes, time: Floats, value: Floats, sigma: Floats, side: str) -> None:
     shown = np.isfinite(time)
     time, value, sigma = time[shown], value[shown], sigma[shown]
     if time.size > DRAWN_SETS:
-        _curve(axis, time, value, side)
+        curve(axis, time, value, side)
         return
     axis.fill_between(time, value - 2 * sigma, value + 2 * sigma, color=COLOURS[side], alpha=0.22, linewidth=0)
     axis.plot(time, value, color=COLOURS[side], label=side)
 
 
-def _legend(axis: Axes) -> None:
+def legend(axis: Axes) -> None:
     """On the line of the title, where no curve can run through it."""
     axis.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2, borderaxespad=0.0)
 

@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from capture.errors import ReconstructError
-from reconstruct import figures
+from reconstruct import figures, signal_figure
 from reconstruct.result import FIGURES, REPORT, Result
 from reconstruct.summary import verdict
 
@@ -52,6 +52,14 @@ PLATES = (
         "The same over the whole flight: mean and range of neighbouring sets.",
         figures.tip_whole,
         figures.is_long,
+    ),
+    Plate(
+        "signals",
+        "The wing",
+        "The tip beside what was recorded with it, at the same instants: of the signals those that go with the tip's "
+        "height most (r, their correlation with it). All are in frames.parquet.",
+        signal_figure.signals,
+        signal_figure.has_signals,
     ),
     Plate(
         "span",

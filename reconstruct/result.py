@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute
 
 from capture.errors import UsageError
+from process.signal_table import GAP
 from reconstruct.tables import (
     FRAMES,
     MARKERS,
@@ -64,6 +65,7 @@ class SideResult:
     reasons: Words  # (F,) str, why a set could not be fitted
     residual_marker: Ints  # (R,) the wing file's markers; ``markers`` has those of the marker table
     residual_m: Floats  # (F, R, 3) measured minus fitted at the set's common instant; NaN where not used
+    signals: Mapping[str, Floats]  # what was recorded beside the frames, by its column of frames.parquet → (F,)
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,11 @@ def read_json_object(path: Path, remedy: str) -> dict[str, Any]:
     return value
 
 
+def signal_names(frames: pa.Table) -> list[str]:
+    """The signals in a frames table: the columns that state the gap they were interpolated over in another."""
+    return [name for name in frames.column_names if name + GAP in frames.column_names]
+
+
 def _side(
     folder: Path, shape: ShapeSeries, markers: MarkerSeries, frames: pa.Table, residuals: pa.Table, unloaded: pa.Table
 ) -> SideResult:
@@ -153,6 +160,7 @@ def _side(
         np.array(_of_side(frames, side).column("reason").to_pylist(), dtype=object),
         per_set.astype(np.int64),
         np.where(residual[..., 3:] > 0, residual[..., :3], np.nan),
+        {name: _dense(frames, side, (name,), (sets,), folder / FRAMES) for name in signal_names(frames)},
     )
 
 

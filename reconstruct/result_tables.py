@@ -82,6 +82,8 @@ def frames_table(fits: SideFits) -> pa.Table:
             "trigger_index": fits.trigger_index,
             "side": _text([fits.side] * fits.trigger_index.size),
             "timestamp_ns": fits.timestamp_ns,
+            "time_sigma_ns": fits.markers.time_sigma_ns,
+            "ptp_state": _text(fits.markers.ptp_state),
             **_flat(TIP_COLUMNS, tip),
             **_flat([f"sigma_{name}" for name in TIP_COLUMNS], sigma_tip),
             **_flat(NET_COLUMNS, fits.net),

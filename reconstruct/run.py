@@ -21,9 +21,11 @@ from process.parts import PartStore
 from process.pipeline import PipelineSettings
 from process.recording import Recording, find_files, open_recording
 from process.shared_error import with_rig
+from process.signal_table import MAX_GAP_S
 from process.tables import MARKER_SCHEMA, write_table
 from process.workers import Crew, crew, usable_cores
 from reconstruct.assemble import Target, assemble
+from reconstruct.beside import Beside, beside_flight, beside_markers
 from reconstruct.compare import Comparison, compare
 from reconstruct.hang import DOUBTFUL_SIGMAS, recorded_hangs
 from reconstruct.identify import identify
@@ -75,6 +77,8 @@ class Job:
     report: bool = True
     scheduler: str | None = None  # a Dask scheduler's address, or local; None: processes of our own
     settings: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
+    dbc: tuple[Path, ...] = ()  # what the recorded CAN frames mean
+    max_gap_s: float = MAX_GAP_S  # that signals are interpolated over
 
 
 @dataclass
@@ -117,7 +121,7 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
                 job.out.rmdir()
             raise
         _remove_stale(job)
-        found = assemble(store, measured, fitted, Target(job.out, job.csv, note, source.rig))
+        found = assemble(store, measured, fitted, Target(job.out, job.csv, note, source.rig, source.beside))
         clock.written = time.monotonic()
     hangs = recorded_hangs(wing, found.wings)
     summary = {
@@ -174,6 +178,7 @@ class _Source:
         self.problems: tuple[str, ...] = ()
         self.flight_s = 0.0
         self.rig: Rig | None = None
+        self.beside: Beside | None = None
         self.shared: dict[str, SharedError]
         self._job = job
         self._recording: Recording | None = None
@@ -181,6 +186,7 @@ class _Source:
         if job.markers is not None:
             self._table = read_table(job.markers, ())
             self.name = str(job.markers)
+            self.beside = beside_markers(job.markers)
             self.shared = shared_errors(self._table)
             self.work_s = self._table.num_rows / ROWS_A_SECOND
             return
@@ -197,13 +203,14 @@ class _Source:
             assert self.rig is not None
             self._recording = open_recording(self._job.flights)
             check_cameras(self._recording.files, self.rig)
-            self.problems = self._recording.problems
+            self.beside = beside_flight(self._job.flights, self._job.dbc, self._job.max_gap_s)
+            self.problems = (*self._recording.problems, *self.beside.signals.problems)
             self.flight_s = self._recording.duration_s
 
     def note(self, plan: FitPlan) -> dict[str, Any]:
         """How a result of it is made: all that the result depends on."""
         job = self._job
-        inputs = [path for path in (job.wing, job.rig, job.markers, _reference_file(job)) if path is not None]
+        inputs = [path for path in (job.wing, job.rig, job.markers, _reference_file(job), *job.dbc) if path is not None]
         config = {
             "measuring": dataclasses.asdict(job.settings),
             "instants": dataclasses.asdict(plan.instants),

@@ -306,16 +306,8 @@ def as_in(half: HalfWing, series: MarkerSeries) -> MarkerSeries:
     xyz, cov = np.full((sets, markers, 3), np.nan), np.full((sets, markers, 3, 3), np.nan)
     flags = np.full((sets, markers), "not_seen", dtype=object)
     time[:, to], xyz[:, to], cov[:, to], flags[:, to] = series.timestamp_ns, series.xyz_m, series.cov_m2, series.flags
-    return MarkerSeries(
-        series.side,
-        np.asarray(half.marker_ids, dtype=np.int64),
-        series.trigger_index,
-        series.frame_timestamp_ns,
-        time,
-        xyz,
-        cov,
-        flags,
-    )
+    marker = np.asarray(half.marker_ids, dtype=np.int64)
+    return replace(series, marker=marker, timestamp_ns=time, xyz_m=xyz, cov_m2=cov, flags=flags)
 
 
 def _fits(how: FitHow, stretch: Stretch) -> tuple[Ints, Iterable[Fit]]:

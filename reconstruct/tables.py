@@ -12,6 +12,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from capture.errors import UsageError
+from capture.record import PtpState
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -37,7 +38,11 @@ REFERENCE_POSITION = ("reference_x_m", "reference_y_m", "reference_z_m")
 RESIDUAL = ("residual_x_m", "residual_y_m", "residual_z_m")
 LOAD_COLUMNS = ("fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
 NET_COLUMNS = tuple(f"net_{name}" for name in LOAD_COLUMNS)
-_PER_SET = ("trigger_index", "frame_timestamp_ns", "timestamp_ns", "xyz_m", "cov_m2", "flags")  # of MarkerSeries
+TIME_COLUMNS = ("time_sigma_ns", "ptp_state")
+_PER_SET = (  # of MarkerSeries
+    *("trigger_index", "frame_timestamp_ns", "timestamp_ns", "xyz_m", "cov_m2", "flags"),
+    *TIME_COLUMNS,
+)
 _TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -53,6 +58,8 @@ class MarkerSeries:
     xyz_m: Floats  # (F, M, 3) body frame
     cov_m2: Floats  # (F, M, 3, 3); NaN where the table has none
     flags: Words  # (F, M) str, empty when good
+    time_sigma_ns: Floats  # (F,) one sigma of the common instant; NaN: not known
+    ptp_state: Words  # (F,) str, of the recorder's PTP port; UNKNOWN where the table does not say
 
     @property
     def seen(self) -> Bools:
@@ -124,6 +131,8 @@ def marker_series(table: pa.Table, name: str) -> dict[str, MarkerSeries]:
         "xyz": _stack(table, POSITION, name),
         "cov": _stack(table, COVARIANCE, name),
         "flags": _words(table, "flags"),
+        "time_sigma_ns": _stack(table, ("time_sigma_ns",), name)[:, 0],
+        "ptp_state": _words(table, "ptp_state"),
     }
     series = {}
     for side, pick in _by_side(table, name):
@@ -238,7 +247,10 @@ def _dense_markers(side: str, triggers: Ints, frame_of: Ints, rows: Mapping[str,
     for column, (i, j) in enumerate(_TRIANGLE):
         cov[frame_of, marker_of, i, j] = cov[frame_of, marker_of, j, i] = rows["cov"][:, column]
     xyz[~np.isfinite(xyz).all(axis=-1)] = np.nan
-    return MarkerSeries(side, markers, triggers, last, time, xyz, cov, flags)
+    sigma_ns, state = np.full(triggers.size, np.nan), np.full(triggers.size, PtpState.UNKNOWN.name, dtype=object)
+    sigma_ns[frame_of], state[frame_of] = rows["time_sigma_ns"], rows["ptp_state"]  # the same for a whole set
+    state[state == ""] = PtpState.UNKNOWN.name
+    return MarkerSeries(side, markers, triggers, last, time, xyz, cov, flags, sigma_ns, state)
 
 
 def _positions(frame_of: Ints, item_of: Ints, shape: tuple[int, int], name: str, what: str) -> Ints:

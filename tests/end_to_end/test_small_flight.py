@@ -70,6 +70,33 @@ def test_the_errors_are_those_of_the_tables(demo):
     assert rms_mm == pytest.approx(json.loads((demo / "summary.json").read_text())["marker_rms_mm"], rel=0.03)
 
 
+def test_load_factor_and_controls_stand_beside_the_tip(demo):
+    """Each against the truth at the sets' own instants.
+
+    The load factor changes by at most 3 a second (a gust of 0.4 at 1.1 Hz): 10 ms of latency, on a busy computer, are
+    0.03.
+    """
+    frames = {name: column.to_numpy() for name, column in columns(demo / "result/frames.parquet")}
+    truth = {name: column.to_numpy() for name, column in columns(demo / "truth/aircraft.parquet")}
+    start_ns = truth["timestamp_ns"][0]
+    at_s, times_s = ((times - start_ns) * 1e-9 for times in (frames["timestamp_ns"], truth["timestamp_ns"]))
+    for signal, true, within in (
+        ("load_factor", "load_factor", 0.03), ("airspeed", "airspeed_mps", 0.1), ("elevator", "elevator_deg", 0.5),
+        ("elevator_analog_deg", "elevator_deg", 0.1), ("attitude_roll", "roll_rad", 0.05),
+    ):  # fmt: skip
+        known = np.isfinite(frames[signal])
+        assert known.mean() > 0.9, signal  # the autopilot and the bus start when they start
+        errors = frames[signal][known] - np.interp(at_s[known], times_s, truth[true])
+        assert np.sqrt(np.mean(errors**2)) < within, signal
+        assert np.nanmax(frames[f"{signal}_gap_s"]) <= 0.5
+    known = np.isfinite(frames["load_factor"]) & np.isfinite(frames["tip_dz_m"])
+    for side in ("left", "right"):
+        mine = known & (frames["side"] == side)
+        assert np.corrcoef(frames["tip_dz_m"][mine], frames["load_factor"][mine])[0, 1] > 0.9
+    assert (demo / "result/figures/signals.png").exists()
+    assert np.isfinite(frames["time_sigma_ns"]).all()
+
+
 def test_nothing_that_measures_needs_the_truth(demo, tmp_path):
     """The same markers and shapes with the truth out of the way."""
     hidden = tmp_path / "truth"

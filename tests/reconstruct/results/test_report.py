@@ -11,6 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from capture.errors import ReconstructError, UsageError
+from process.signal_table import sets_of, signal_table, signals_path
+from process.signals import Signal, Signals
 from reconstruct import figures
 from reconstruct.report import COMPARED_PLATES, PLATES, Plate, write_report
 from reconstruct.result import read_result
@@ -42,12 +44,16 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def result(bending_wing: Any, wing_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A result of 12 sets a wing, one of them blind, compared with its truth."""
+    """A result of 12 sets a wing, one of them blind, with a signal beside them, compared with its truth."""
     folder = tmp_path_factory.mktemp("report")
     table = bending_wing().marker_table(np.arange(12) * 0.04, sigma_m=0.001, missing=0.05)
     x = np.asarray(table.column("x_m")).copy()
     x[18 * 4 : 18 * 5] = np.nan
     pq.write_table(table.set_column(table.column_names.index("x_m"), "x_m", [x]), folder / "table.parquet")
+    sets = sets_of(table)
+    time_ns = np.unique(sets.column("timestamp_ns").to_numpy())
+    load_factor = Signal("load_factor", "/can", "g", time_ns, np.sin(np.arange(time_ns.size)))
+    pq.write_table(signal_table(sets, Signals((load_factor,))), signals_path(folder / "table.parquet"))
     truth = bending_wing().reference(folder / "truth <&>", np.arange(-0.1, 0.6, 0.01))
     out = folder / "out"
     run_job(Job((), None, folder / "table.parquet", wing_file, out, True, 1, "made by a test"), lambda *_: None)
