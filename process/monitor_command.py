@@ -6,7 +6,7 @@ import os
 import socket
 import stat
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import typer
@@ -14,9 +14,12 @@ import typer
 from capture.console import note
 from capture.errors import ProcessError, UsageError
 from capture.health import default_folder
+from capture.worker import Worker
 
 LEAST_TOKEN = 16  # characters
 _NICE = 10
+_STOP_S = 5.0
+_BACKLOG = 128
 
 
 def monitor(
@@ -33,6 +36,10 @@ def monitor(
     ] = None,
     certificate: Annotated[Path | None, typer.Option(help="PEM certificate: the page is then https.")] = None,
     key: Annotated[Path | None, typer.Option(help="PEM key of the certificate.")] = None,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Port of a live server for the Foxglove app, on this computer only."),
+    ] = None,
 ) -> None:
     """Show the recorder's health as a page, and as metrics at /metrics, until stopped.
 
@@ -63,11 +70,25 @@ def monitor(
     gallery.start()
     scheme = "http" if certificate is None else "https"
     shown = f"[{host}]" if ":" in host else host
+    bridge = None if foxglove is None else _bridge(foxglove, status, gallery)
     note(f"monitor: {scheme}://{shown}:{listener.getsockname()[1]}/ of {folder or default_folder()}")
     try:
         server.run(sockets=[listener])
     finally:
-        gallery.stop(5.0)
+        if bridge is not None:
+            bridge.stop(_STOP_S)
+        gallery.stop(_STOP_S)
+
+
+def _bridge(port: int, status: Any, gallery: Any) -> Worker:
+    try:
+        from process.monitor.bridge import Bridge
+    except ImportError as error:
+        raise ProcessError(f"{error.name} is not installed: pip install 'wingshape[foxglove]'") from error
+    bridge = Bridge(port, status, gallery)
+    bridge.start()
+    note(f"foxglove: ws://127.0.0.1:{bridge.port}")
+    return bridge
 
 
 def own_hosts(host: str) -> frozenset[str]:
@@ -110,6 +131,7 @@ def _listen(host: str, port: int) -> socket.socket:
         listener = socket.socket(family, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
+        listener.listen(_BACKLOG)  # who asks from now on is answered, if a little later
     except OSError as error:
         raise UsageError(
             f"--host {host} --port {port}: cannot listen there ({error.strerror}): give another"

@@ -70,7 +70,6 @@ def make_server(app: Callable[..., Any], certificate: Path | None = None, key: P
         server_header=False,
         date_header=False,
         proxy_headers=False,
-        backlog=128,
         timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=2,
         h11_max_incomplete_event_size=MAX_HEAD_BYTES,
