@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 
 from capture.errors import UsageError
 from reconstruct.aerodynamic import aerodynamic, upwards
+from reconstruct.beside import Beside
 from reconstruct.rotation import Array
 from reconstruct.tables import LOAD_COLUMNS, NET_COLUMNS, POSITION, SIDES, SIGMA, read_table
 from reconstruct.wing import Wing
@@ -25,13 +26,22 @@ class SpecificForce:
 
     names: tuple[str, ...]
 
-    def of(self, frames: pa.Table) -> Array:
-        """(F, 3) m/s², body axes, of the sets of frames.parquet. Raises UsageError when a signal was not recorded."""
-        missing = [name for name in self.names if name not in frames.column_names]
+    def check(self, wing: Wing, beside: Beside | None) -> None:
+        """Raises UsageError when a signal was not recorded, or the wing file has no masses."""
+        names = [] if beside is None else beside.names
+        missing = [name for name in self.names if name not in names]
         if missing:
-            numbers = [member.name for member in frames.schema if pa.types.is_floating(member.type)]
-            others = ", ".join(name for name in numbers if not name.startswith(("tip_", "net_", "sigma_")))
-            raise UsageError(f"--specific-force {missing[0]}: no such signal beside the frames; there are: {others}")
+            raise UsageError(
+                f"--specific-force {missing[0]}: no such signal was recorded beside the frames; "
+                + (f"there are {', '.join(names)}" if names else "there is none (CAN needs --dbc)")
+            )
+        if not np.sum(wing.left.mass_kg) + np.sum(wing.right.mass_kg) > 0:
+            raise UsageError(
+                f"--specific-force: the wing {wing.name!r} has no masses; give mass_per_m or [[mass]] in its file"
+            )
+
+    def of(self, frames: pa.Table) -> Array:
+        """(F, 3) m/s², body axes, of the sets of frames.parquet."""
         values = [frames.column(name).to_numpy() for name in self.names]
         return upwards(values[0]) if len(values) == 1 else np.column_stack(values)
 
@@ -51,9 +61,7 @@ def air_table(wing: Wing, shape_path: Path, frames: pa.Table, force: SpecificFor
         wing: with the masses that weigh.
         shape_path: shape.parquet; its columns are read a wing at a time.
         frames: frames.parquet, with what was recorded beside the frames.
-        force: which signals to take.
-
-    Raises UsageError when a signal was not recorded, or the wing file has no masses.
+        force: which signals to take; checked.
     """
     specific_force = force.of(frames)
     noise = [f"noise_{name}" for name in SIGMA]
@@ -64,8 +72,6 @@ def air_table(wing: Wing, shape_path: Path, frames: pa.Table, force: SpecificFor
         if not own.any():
             continue
         half = wing.left if side == "left" else wing.right
-        if not np.sum(half.mass_kg) > 0:
-            raise UsageError(f"--specific-force: the wing {wing.name!r} has no masses; give mass_per_m or [[mass]]")
         sets = frames.filter(pa.array(own))
         nodes = len(half.node_s_m)
         places = shape.filter(pc.equal(shape.column("side"), side))

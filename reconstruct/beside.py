@@ -22,6 +22,14 @@ class Beside:
     max_gap_s: float = MAX_GAP_S
     table: pa.Table | None = None
 
+    @property
+    def names(self) -> list[str]:
+        """Of the numbers among the signals."""
+        if self.table is None:
+            return [signal.name for signal in self.signals.signals]
+        known = [member.name for member in self.table.schema if pa.types.is_floating(member.type)]
+        return [name for name in known if not name.endswith(GAP)]
+
     def joined(self, frames: pa.Table) -> pa.Table:
         """``frames`` with a column for each signal, its gap, what is missing, and the gates that failed.
 

@@ -20,6 +20,7 @@ from capture.errors import UsageError
 from process.reference import parse_window
 from process.signal_options import DbcOption, MaxGapOption
 from process.signal_table import MAX_GAP_S
+from reconstruct.air_table import NAMES, parse_specific_force
 from reconstruct.import_wing import import_wing
 from reconstruct.plan import plan
 from reconstruct.report import write_report
@@ -74,6 +75,10 @@ def run_command(
     ] = None,
     dbc: DbcOption = None,
     max_gap: MaxGapOption = MAX_GAP_S,
+    specific_force: Annotated[
+        str | None,
+        typer.Option(help=f"Aerodynamic loads too, by these signals of the aircraft's acceleration: {NAMES}."),
+    ] = None,
     csv: Annotated[bool, typer.Option(help="Write the tables as CSV too.")] = True,
     report: Annotated[bool, typer.Option(help="Draw the report; `reconstruct report` can do so later.")] = True,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
@@ -99,6 +104,7 @@ def run_command(
         *(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest, report, scheduler),
         dbc=tuple(dbc or ()),
         max_gap_s=max_gap,
+        specific_force=None if specific_force is None else parse_specific_force(specific_force),
     )
     with _progress() as progress:
         summary, warnings = run_job(job, progress)

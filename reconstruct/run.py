@@ -22,8 +22,9 @@ from process.pipeline import PipelineSettings
 from process.recording import Recording, find_files, open_recording
 from process.shared_error import with_rig
 from process.signal_table import MAX_GAP_S
-from process.tables import MARKER_SCHEMA, write_table
+from process.tables import MARKER_SCHEMA, TableWriter, write_table
 from process.workers import Crew, crew, usable_cores
+from reconstruct.air_table import AIR, SpecificForce, air_table
 from reconstruct.assemble import Target, assemble
 from reconstruct.beside import Beside, beside_flight, beside_markers
 from reconstruct.compare import Comparison, compare
@@ -79,6 +80,7 @@ class Job:
     settings: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
     dbc: tuple[Path, ...] = ()  # what the recorded CAN frames mean
     max_gap_s: float = MAX_GAP_S  # that signals are interpolated over
+    specific_force: SpecificForce | None = None  # signals that tell the aircraft's acceleration; None: net loads only
 
 
 @dataclass
@@ -107,6 +109,8 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
     with MemoryWatch() as memory, crew(_workers(job, source), job.scheduler, MODULES) as hands:
         clock.first_byte = time.monotonic()
         source.open()
+        if job.specific_force is not None:
+            job.specific_force.check(wing, source.beside)
         note = source.note(plan)
         store = PartStore(job.out / PARTS, {key: value for key, value in note.items() if key != "command"})
         resumed = len(store) > 0
@@ -122,6 +126,10 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
             raise
         _remove_stale(job)
         found = assemble(store, measured, fitted, Target(job.out, job.csv, note, source.rig, source.beside))
+        if job.specific_force is not None:
+            air = air_table(wing, job.out / SHAPE, found.frames, job.specific_force)
+            with TableWriter(job.out / AIR, air.schema, note, csv=job.csv) as writer:
+                writer.append(air)
         clock.written = time.monotonic()
     hangs = recorded_hangs(wing, found.wings)
     summary = {
@@ -238,8 +246,8 @@ def _telling(progress: Progress, stage: str, flight_s: float) -> Callable[[int, 
 
 def _remove_stale(job: Job) -> None:
     """A run that fails half way must not leave an older one's words."""
-    texts = [Path(name).with_suffix(".csv").name for name in (SHAPE, FRAMES, LOADS, RESIDUALS, MARKERS)]
-    for stale in (REPORT, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
+    texts = [Path(name).with_suffix(".csv").name for name in (SHAPE, FRAMES, LOADS, RESIDUALS, MARKERS, AIR)]
+    for stale in (AIR, REPORT, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
         (job.out / stale).unlink(missing_ok=True)
 
 
