@@ -80,7 +80,7 @@ class AnalogLog:
         """No message after this returns. Safe to call twice."""
         self._put = None
         board, self._board = self._board, None
-        if board is not None and board.error is None:
+        if board is not None and board.error is None and not board.gone:
             with contextlib.suppress(TriggerBoardError):  # it has been silent before, and that is in the statuses
                 board.sample(0.0)
 

@@ -51,7 +51,7 @@ def usb_findings(tree: UsbTree, cameras: Sequence[WantedCamera], asked: Asked) -
         there[camera.place] = device
         findings += [_link(camera, device), *_permission(camera, device)]
     if there:
-        findings += [*_power(tree, there), _memory(tree, len(there)), *_bandwidth(there, asked)]
+        findings += [*_power(tree, there), _memory(tree, len(cameras)), *_bandwidth(there, asked)]
     return findings
 
 
