@@ -105,6 +105,12 @@ class CameraDefaults(_Table):
     exposure_us: Annotated[int, Field(gt=0, le=1_000_000)] = 2000
     gain_db: float = 0.0
     row_time_us: Annotated[float | None, Field(ge=0, le=1000)] = None  # None: as the camera says, if it does
+    black_level: float | None = None  # in the camera's own unit; None: left as it is
+    shutter_mode: str | None = None  # by the camera's own name; None: left as it is
+    offset_x: Annotated[int, Field(ge=0)] = 0  # of the image on the sensor
+    offset_y: Annotated[int, Field(ge=0)] = 0
+    trigger_line: str = "Line0"
+    trigger_activation: Literal["RisingEdge", "FallingEdge"] = "RisingEdge"
     trigger_latency_us: Annotated[float, Field(ge=0)] = 0.0  # from trigger to exposure, by the camera's data sheet
     time_sigma_limit_us: Annotated[float, Field(gt=0)] = 50.0  # of a frame's instant; beyond it, a gate fails
 
@@ -201,7 +207,31 @@ class Config(_Table):
     def settings(self) -> CameraSettings:
         """What every camera is asked to be."""
         camera = self.camera
-        return CameraSettings(camera.width, camera.height, camera.exposure_us, camera.gain_db)
+        return CameraSettings(
+            width=camera.width,
+            height=camera.height,
+            exposure_us=camera.exposure_us,
+            gain_db=camera.gain_db,
+            offset_x=camera.offset_x,
+            offset_y=camera.offset_y,
+            black_level=camera.black_level,
+            shutter_mode=camera.shutter_mode,
+            trigger_line=camera.trigger_line,
+            trigger_activation=camera.trigger_activation,
+        )
+
+    @property
+    def exposure_warning(self) -> str | None:
+        """What speaks against the exposure, with the figures; None: nothing does."""
+        low_us, high_us = GOOD_EXPOSURE_US
+        exposure_us = self.camera.exposure_us
+        if low_us <= exposure_us <= high_us:
+            return None
+        effect = "lights may be too faint" if exposure_us < low_us else "lights saturate, grow halos and smear"
+        return (
+            f"exposure {exposure_us} us is outside {low_us} to {high_us} us: {effect}; "
+            "set `camera.exposure_us`, and close the aperture rather than going below"
+        )
 
     @property
     def ring_slots(self) -> int:
@@ -209,6 +239,9 @@ class Config(_Table):
         partner's room, see capture.grabber.SideGate), and what the driver always holds."""
         return max(math.ceil(self.ring.stall_s * self.trigger.rate_hz), DRIVER_BUFFERS + 1) + DRIVER_BUFFERS
 
+
+GOOD_EXPOSURE_US = (1000, 5000)
+"""Within it the paper's lights were found to be neither faint nor saturated (section on exposure, Figs. 11 to 13)."""
 
 DRIVER_BUFFERS = 10
 """Buffers a driver is given, so that a full ring is met by us, with a cause, and not by the driver. At the start some

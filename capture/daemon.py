@@ -153,6 +153,8 @@ class Recording:
         share_interpreter()
         with contextlib.ExitStack() as cleanup:
             cleanup.enter_context(self._watched())
+            if self._config.exposure_warning is not None:
+                self._progress(self._config.exposure_warning)
             self._open_cameras(cleanup)
             run = self._make_run()
             cleanup.callback(run.board.close)

@@ -191,8 +191,7 @@ class Grabber(Worker):
             found = self._camera.open()
             if found.serial != self._description.serial:
                 raise CameraError(f"serial {found.serial} answers, not {self._description.serial}: swap the cables")
-            self._description = found
-            self._numbering, self._frame_clock = self._aligned(found)
+            self._numbering, self._frame_clock = self._aligned(self._description)
             self._ledger.absent(self.place, absence.cause)
             self.arm()
         except CameraError as error:

@@ -44,7 +44,8 @@ class FrameNumbering:
     before its exposure can have begun, or, when it was delivered late, to an earlier one; so the earliest of what
     they say about the first frame is believed. From then on the *device's* clock says how many periods have passed
     since the last frame (host time is late when the host is busy, the device's is not), and its frame counter says
-    how many of the skipped triggers were exposed.
+    how many of the skipped triggers were exposed. A device whose clock jumps is noticed by frames that fit no trigger:
+    after ``CONFIRMING`` of them in a row it is begun with anew.
     """
 
     def __init__(self, camera: CameraDescription, triggers: Triggers) -> None:
@@ -52,6 +53,7 @@ class FrameNumbering:
         self._triggers = triggers
         self._held: list[Grab] = []
         self._last: tuple[Grab, Numbered] | None = None
+        self._strays = 0  # frames in a row that were nobody's
 
     def feed(self, grab: Grab) -> list[tuple[Grab, Numbered | None]]:
         """Take a frame; the frames that can be told now, in order.
@@ -59,7 +61,11 @@ class FrameNumbering:
         A frame is None when it is none of a trigger's: a duplicate, or one that no trigger asked for.
         """
         if self._last is not None:
-            return [(grab, self._next(grab, self._last))]
+            numbered = self._next(grab, self._last)
+            self._strays = 0 if numbered else self._strays + 1
+            if self._strays >= CONFIRMING:  # its clock has begun anew
+                self._last, self._strays = None, 0
+            return [(grab, numbered)]
         self._held.append(grab)
         return self.flush() if len(self._held) >= CONFIRMING else []
 

@@ -111,7 +111,7 @@ def gige(
 ) -> None:
     """Be GigE Vision cameras on a trigger line until SIGTERM or SIGINT. Says `ready` on standard output when usable.
 
-    For a network namespace of its own: `unshare --net sh -c 'ip link set lo up; …'`, recorder included.
+    For a network namespace of its own, recorder included: see docs/how-to/cameras.md.
     """
     from hw_sim.gige import GigeRig
 

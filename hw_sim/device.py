@@ -52,6 +52,7 @@ class CameraDevice:
         self._wanted = 0
         self._free: list[int] = []
         self._plugged = True
+        self._frozen = False
         self._deed = ""  # what happens to the next frame
 
     def connect(self, connection: socket.socket, request: link.OpenRequest) -> link.OpenReply:
@@ -86,6 +87,8 @@ class CameraDevice:
         match deed:
             case "unplug" | "plug":
                 self._plugged = deed == "plug"
+            case "freeze" | "thaw":
+                self._frozen = deed == "freeze"
             case _:
                 self._deed = deed
 
@@ -114,7 +117,7 @@ class CameraDevice:
 
     def expose(self, edge_ns: int) -> tuple[int, link.FrameMessage] | None:
         """Take a frame at a trigger edge: when it is wholly read out (UTC), and its message; None: no frame."""
-        if not self._armed or self._renderer is None:
+        if not self._armed or self._frozen or self._renderer is None:
             return None
         self.counts.exposed += 1
         frame_id = self._frame_id

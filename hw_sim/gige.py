@@ -1,10 +1,10 @@
 """GigE Vision cameras on a trigger line: Aravis' own network camera, fired by the simulated trigger board.
 
 Each camera is a real GigE Vision device as far as the recorder can tell: discovery, control channel with heartbeat,
-GenICam file, packets over the loopback interface at 127.0.0.1, .2, …  It belongs into a network namespace of its own
-(``unshare --net``, then ``ip link set lo up``), since discovery broadcasts. A frame is sent when a real camera would
-have read it out; its first sixteen bytes are the trigger's index and the camera's number, the rest is the camera's
-own noise.
+GenICam file, packets over the loopback interface at 127.0.0.1, .2, …  It belongs into a network namespace of its own,
+since discovery broadcasts (``unshare --net``; ``ip link set lo up``; ``ip address add 127.0.0.2/8 dev lo`` …). A frame
+is sent when a real camera would have read it out; its first sixteen bytes are the trigger's index and the camera's
+number, the rest is the camera's own noise.
 """
 
 import contextlib
@@ -32,6 +32,7 @@ XML = Path(__file__).parent / "gige_camera.xml"
 READOUT_NS = 8_000_000
 STREAM_START_NS = 150_000_000  # the fake begins to stream up to 100 ms after the acquisition was started
 PACKET_BYTES = 8000
+FRAME_STORE = 10  # frames that a camera keeps while the wire, or this program, is busy
 _ACQUISITION, _TRIGGER_MODE, _EDGE, _READY, _PRIVILEGE = 0x124, 0x300, 0x30C, 0x201C, 0x0A00
 _EXPOSURE, _SENSOR_WIDTH, _SENSOR_HEIGHT, _TEMPERATURE, _PACKET_SIZE = 0x120, 0x11C, 0x118, 0x2000, 0x0D04
 _TICK_S = 0.01
@@ -74,7 +75,7 @@ class GigeCamera:
         self.key = ("left_cam0", "left_cam1", "right_cam0", "right_cam1")[number]
         self.address = f"127.0.0.{number + 1}"
         self.exposed = 0
-        self.missed = 0  # edges while it was armed, but still busy with the one before
+        self.missed = 0  # edges while it was armed, but its store was full
         self._library = library
         self._number = number
         self._width, self._height = size
@@ -88,6 +89,8 @@ class GigeCamera:
         self._ready_at_ns: int | None = None  # None: not acquiring
         self._edges: deque[Pulse] = deque()
         self._deed = ""
+        self._runs = threading.Event()  # cleared while its firmware hangs
+        self._runs.set()
 
     def plug(self) -> None:
         """Power up.
@@ -102,8 +105,8 @@ class GigeCamera:
         self._outer = library.new(self.address.encode(), serial.encode(), str(XML).encode())
         if not self._outer or not library.is_running(self._outer):
             raise SimulationError(
-                f"{self.address}: no camera can listen there: run in a network namespace of its own "
-                "(`unshare --net`), with `ip link set lo up`"
+                f"{self.address}: no camera can listen there: run in a network namespace of its own (`unshare --net`), "
+                f"with `ip link set lo up` and `ip address add {self.address}/8 dev lo`"
             )
         self._inner = library.inner(self._outer)
         self._begin_ns = None
@@ -119,6 +122,7 @@ class GigeCamera:
 
     def unplug(self) -> None:
         """Be gone, in the middle of whatever it does."""
+        self._runs.set()  # or its thread could not end
         if self._outer is not None:
             self._library.unref(self._outer)  # its thread is joined
         self._outer, self._ready_at_ns = None, None
@@ -131,6 +135,10 @@ class GigeCamera:
                 self.plug()
             case "unplug":
                 self.unplug()
+            case "freeze":
+                self._runs.clear()
+            case "thaw":
+                self._runs.set()
             case _:
                 self._deed = deed
 
@@ -143,6 +151,7 @@ class GigeCamera:
         if not (self._read(_ACQUISITION) and self._read(_TRIGGER_MODE)):
             if self._ready_at_ns is not None:
                 self._library.write(self._inner, _READY, 0)
+                self._library.write(self._inner, _EDGE, 0)
             self._ready_at_ns = None
             self._edges.clear()
         elif self._ready_at_ns is None:
@@ -160,7 +169,7 @@ class GigeCamera:
         """The frame has been read out."""
         if self._outer is None or self._ready_at_ns is None:
             return
-        if self._edges:  # the fake has not come to the one before
+        if len(self._edges) >= FRAME_STORE:
             self.missed += 1
             return
         self.exposed += 1
@@ -174,7 +183,10 @@ class GigeCamera:
 
     def _fill(self, buffer: int, _data: None, _exposure_us: int, _gain: int, _pixel_format: int) -> None:
         """Called in the camera's own thread for each frame, before it is sent."""
+        self._runs.wait()
         pulse = self._edges.popleft() if self._edges else None
+        if self._edges:
+            self._library.write(self._inner, _EDGE, 1)  # the next one of its store
         deed, self._deed = self._deed, ""
         lost = {"drop": 1.0, "truncate": 0.5}.get(deed, 0.0)  # of the packets that follow
         self._library.set_double(self._outer, b"gvsp-lost-ratio", lost, None)

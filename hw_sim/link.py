@@ -19,7 +19,7 @@ from capture.camera.base import CameraDescription
 SLOTS = 12
 WANT, ARM, DISARM, FREE, FRAME = b"Q", b"A", b"D", b"F", b"G"
 DONE = b"K"
-DEEDS = ("unplug", "plug", "drop", "truncate")
+DEEDS = ("unplug", "plug", "freeze", "thaw", "drop", "truncate")
 _FRAME = struct.Struct("<cIQQIf?")
 _FREE = struct.Struct("<cI")
 MAX_PACKET_BYTES = 4096
@@ -72,7 +72,8 @@ class OpenReply:
 
 @dataclass(frozen=True)
 class Command:
-    """What a hand does to a camera: ``unplug`` and ``plug`` its cable, ``drop`` or ``truncate`` its next frame."""
+    """What is done to a camera: ``unplug`` and ``plug`` its cable, ``freeze`` and ``thaw`` its firmware (it no longer
+    exposes nor answers), ``drop`` or ``truncate`` its next frame."""
 
     deed: str
     camera: str

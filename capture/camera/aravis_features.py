@@ -47,6 +47,7 @@ class Features:
         Raises:
             CameraError: a feature is missing, refused, or was not taken.
         """
+        self._call("arv_camera_stop_acquisition")  # a recorder that was killed may have left it running
         self._enumeration_if_there("TriggerSelector", "FrameStart")
         for name, value in _OFF:
             self._enumeration_if_there(name, value)

@@ -66,6 +66,19 @@ def test_a_repeated_frame_and_one_without_a_trigger_are_nobodys():
     assert [numbered and numbered.index for _, numbered in told] == [0, 1, 2, 3, 4, None]
 
 
+def test_a_clock_that_jumps_costs_a_few_frames_and_no_wrong_one():
+    log = TriggerLog(25)
+    for index in range(40):
+        log.add(Pulse(index, index, START_NS + index * PERIOD_NS, START_NS + index * PERIOD_NS))
+    numbering, told = FrameNumbering(CAMERA, log), []
+    for index in range(40):
+        ticks = index * PERIOD_NS + (10**15 if index < 10 else 0)
+        receive_ns = START_NS + index * PERIOD_NS + EXPOSURE_US * 1000 + ROW_NS * HEIGHT + 1_000_000
+        told += numbering.feed(Grab(0, index, ticks, receive_ns, EXPOSURE_US, 0.0, FrameStatus.COMPLETE))
+    numbers = [(grab.frame_id, numbered and numbered.index) for grab, numbered in told]
+    assert numbers == [(k, None if 10 <= k < 10 + CONFIRMING else k) for k in range(40)]
+
+
 def test_the_log_believes_no_pulse_that_goes_back():
     log = TriggerLog(25)
     for index, time_ns in ((5, 1_000_000_000), (5, 1_000_000_001), (4, 2_000_000_000), (6, 999_999_999)):

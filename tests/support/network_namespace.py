@@ -1,4 +1,4 @@
-"""A network namespace for the calling thread and all that it starts: only a loopback interface, which is up."""
+"""A network namespace for the calling thread and all that it starts: only a loopback interface, at 127.0.0.1 to .4."""
 
 import contextlib
 import ctypes
@@ -21,6 +21,8 @@ def network_namespace() -> Iterator[None]:
     try:
         _check(libc.unshare(_CLONE_NEWNET))
         subprocess.run([ip, "link", "set", "lo", "up"], check=True)
+        for number in (2, 3, 4):
+            subprocess.run([ip, "address", "add", f"127.0.0.{number}/8", "dev", "lo"], check=True)
         yield
     finally:
         _check(libc.setns(before, _CLONE_NEWNET))
