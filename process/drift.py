@@ -238,7 +238,7 @@ def _lights(
 ) -> Iterator[Array]:
     """(L, 2, 2) means of the lights' pixels over a few sets of each block."""
     by_trigger = {places.trigger_index: places for places in sets}
-    with FrameSetReader(reuse=True) as reader:
+    with FrameSetReader() as reader:
         for begin, end in edges:
             triggers = np.unique(columns["trigger_index"][_during(columns, begin, end)])
             some = np.linspace(0, len(triggers) - 1, min(LIGHT_SETS_A_BLOCK, len(triggers))).astype(int)

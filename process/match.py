@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from process.camera_model import MarkerLayout, RigSide
 from process.detect import Detections
-from process.triangulate import Rays, epipolar_distance_px, rays, rectified_pixels, triangulate_rays
+from process.triangulate import Points, Rays, epipolar_distance_px, rays, rectified_pixels, triangulate_rays
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -82,6 +82,8 @@ class Matches:
     """for the next frame; None if there was too little to follow"""
     rays: tuple[Rays, Rays] | None = None
     """all spots of cam0 and cam1, taken through the lens; None where nothing was matched"""
+    points: Points | None = None
+    """of the seen markers, in their order, by least reprojection error; None where matching did not need them"""
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -97,6 +99,16 @@ class _Candidates:
     covariance_m2: Array
     epipolar_px: Array  # signed
     epipolar_d2: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """The spots of one frame set, through the lenses, and which of them may belong together."""
+
+    detections: tuple[Detections, Detections]
+    rays: tuple[Rays, Rays]
+    candidates: _Candidates | None
+    """None for the paper's way, which needs none"""
 
 
 def match(
@@ -115,12 +127,56 @@ def match(
     and nothing else.
     """
     settings = settings or MatchSettings()
-    pair = side.pair
-    rays0 = rays(pair.cam0, detections[0].pixels, detections[0].covariance_px2)
-    rays1 = rays(pair.cam1, detections[1].pixels, detections[1].covariance_px2)
+    return match_sighting(
+        side_name,
+        side,
+        layout,
+        sightings(side_name, side, layout, [detections], settings)[0],
+        trigger_index,
+        track,
+        settings,
+    )
+
+
+def sightings(
+    side_name: str,
+    side: RigSide,
+    layout: MarkerLayout,
+    found: Sequence[tuple[Detections, Detections]],
+    settings: MatchSettings,
+) -> list[Sighting]:
+    """What ``match_sighting`` needs of frame sets: all of them together, which is faster than one by one."""
+    through = [
+        _split(
+            rays(
+                camera,
+                np.concatenate([detections[number].pixels for detections in found]),
+                np.concatenate([detections[number].covariance_px2 for detections in found]),
+            ),
+            [len(detections[number]) for detections in found],
+        )
+        for number, camera in enumerate((side.pair.cam0, side.pair.cam1))
+    ]
+    both = list(zip(*through, strict=True))
     if settings.method == "rows":
-        return _match_by_rows(side, layout, rays0, rays1)
-    candidates = _candidates(side_name, side, layout, detections, rays0, rays1, settings)
+        return [Sighting(detections, pair, None) for detections, pair in zip(found, both, strict=True)]
+    candidates = _candidates(side_name, side, layout, found, both, settings)
+    return [Sighting(*one) for one in zip(found, both, candidates, strict=True)]
+
+
+def match_sighting(
+    side_name: str,
+    side: RigSide,
+    layout: MarkerLayout,
+    sighting: Sighting,
+    trigger_index: int,
+    track: Track | None,
+    settings: MatchSettings,
+) -> Matches:
+    """``match`` of a frame set that has been through ``sightings``."""
+    detections, candidates = sighting.detections, sighting.candidates
+    if candidates is None:
+        return _match_by_rows(side, layout, *sighting.rays)
     wing = _Wing(side_name, layout)
     result = None if track is None else _follow(wing, candidates, track, trigger_index, settings)
     if result is None or _leaves_spots(result[0], detections):
@@ -139,8 +195,19 @@ def match(
         margin,
         ambiguous,
         next_track,
-        (rays0, rays1),
+        sighting.rays,
+        _points(candidates, chosen[seen]),
     )
+
+
+def _points(candidates: _Candidates, chosen: Indices) -> Points:
+    xyz_m, covariance_m2 = candidates.xyz_m[chosen], candidates.covariance_m2[chosen]
+    return Points(xyz_m, covariance_m2, candidates.epipolar_px[chosen], ("",) * len(chosen))
+
+
+def _split(whole: Rays, counts: Sequence[int]) -> list[Rays]:
+    ends = np.cumsum(counts).tolist()
+    return [whole[slice(begin, end)] for begin, end in pairwise([0, *ends])]
 
 
 def wing_places_m(side_name: str, layout: MarkerLayout, tip_slope_rad: float) -> Array:
@@ -200,30 +267,45 @@ def _candidates(
     side_name: str,
     side: RigSide,
     layout: MarkerLayout,
-    detections: tuple[Detections, Detections],
-    rays0: Rays,
-    rays1: Rays,
+    found: Sequence[tuple[Detections, Detections]],
+    through: Sequence[tuple[Rays, Rays]],
     settings: MatchSettings,
-) -> _Candidates:
-    """Pairs of spots on each other's epipolar lines that meet in front of the cameras, where a wing can be."""
-    distance_px = epipolar_distance_px(side.pair, rays0.xy[:, None, :], rays1.xy[None, :, :])
-    noise0, noise1 = (np.trace(d.covariance_px2, axis1=1, axis2=2) / 2.0 for d in detections)
-    variance = (noise0[:, None] + noise1[None, :]) / 2.0 + settings.epipolar_allowance_px**2
-    d2 = distance_px**2 / variance
-    spot0, spot1 = np.nonzero(d2 < settings.epipolar_gate**2)
-    points = triangulate_rays(side, rays0[spot0], rays1[spot1])
+) -> list[_Candidates]:
+    """Of each set: spots on each other's epipolar lines that meet in front of the cameras, where a wing can be."""
+    pairs, distances_px, d2s = [], [], []
+    for detections, (rays0, rays1) in zip(found, through, strict=True):
+        distance_px = epipolar_distance_px(side.pair, rays0.xy[:, None, :], rays1.xy[None, :, :])
+        noise0, noise1 = (np.trace(d.covariance_px2, axis1=1, axis2=2) / 2.0 for d in detections)
+        variance = (noise0[:, None] + noise1[None, :]) / 2.0 + settings.epipolar_allowance_px**2
+        d2 = distance_px**2 / variance
+        spots = np.nonzero(d2 < settings.epipolar_gate**2)
+        pairs.append(spots)
+        distances_px.append(distance_px[spots])
+        d2s.append(d2[spots])
+    points = triangulate_rays(
+        side, *(Rays.join([one[k][spots[k]] for one, spots in zip(through, pairs, strict=True)]) for k in (0, 1))
+    )
     outboard_m = points.xyz_m[:, 1] * (1.0 if side_name == "right" else -1.0)
     reach_m = 1.1 * layout.pairs_station_m[-1] + 0.2
     with np.errstate(invalid="ignore"):
         inside = (np.linalg.norm(points.xyz_m, axis=1) < reach_m) & (outboard_m > -0.1)
-    return _Candidates(
-        spot0[inside],
-        spot1[inside],
-        points.xyz_m[inside],
-        points.covariance_m2[inside],
-        distance_px[spot0, spot1][inside],
-        d2[spot0, spot1][inside],
-    )
+    candidates = []
+    begin = 0
+    for (spot0, spot1), distance, distance2 in zip(pairs, distances_px, d2s, strict=True):
+        own = slice(begin, begin + len(spot0))
+        begin += len(spot0)
+        good = inside[own]
+        candidates.append(
+            _Candidates(
+                spot0[good],
+                spot1[good],
+                points.xyz_m[own][good],
+                points.covariance_m2[own][good],
+                distance[good],
+                distance2[good],
+            )
+        )
+    return candidates
 
 
 def _start(wing: _Wing, candidates: _Candidates, settings: MatchSettings) -> _Result:

@@ -8,7 +8,7 @@ Format: https://mcap.dev/spec (records and opcodes), version 0.
 import hashlib
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import get_chunk_data_stream
+
+from process.spans import Spans
 
 MAGIC = b"\x89MCAP0\r\n"
 CHANNEL, MESSAGE, CHUNK, DATA_END = 0x04, 0x05, 0x06, 0x0F
@@ -96,24 +98,27 @@ def index_file(path: Path) -> FileIndex:
 
 
 class ChunkReader:
-    """Reads messages; keeps the last chunk, and the files open. Each thread or process needs its own.
+    """Reads messages; keeps the last chunk, and the files open. Each thread or process needs its own."""
 
-    With ``reuse`` the bytes of a chunk go into one buffer for the reader's whole life, so that what was read before
-    is overwritten by the next chunk: saves the kernel from clearing 3 MB a frame.
-    """
-
-    def __init__(self, *, reuse: bool = False) -> None:
-        self._reuse = reuse
-        self._buffer = bytearray()
+    def __init__(self) -> None:
+        self._spans = Spans()
         self._descriptors: dict[str, int] = {}
         self._last: tuple[str, int] | None = None
         self._records = memoryview(b"")
+
+    def load(self, places: Iterable[Place]) -> None:
+        """Read the chunks of ``places`` at once, in few large reads, for ``read`` to give out.
+
+        Memory that was given out before is overwritten. What cannot be read now, ``read`` will say.
+        """
+        self._last = None
+        self._spans.load({(place.path, place.chunk_at, place.chunk_size) for place in places})
 
     def read(self, place: Place) -> memoryview:
         """The message's data. Raises ``BadChunk`` if the chunk fails its CRC or is cut, ``OSError`` from the disk."""
         if self._last != (place.path, place.chunk_at):
             self._last = None
-            self._records = self._read_chunk(place)
+            self._records = _records_of_chunk(self._chunk(place))
             self._last = (place.path, place.chunk_at)
         return self._records[place.at : place.at + place.size]
 
@@ -123,18 +128,18 @@ class ChunkReader:
             os.close(descriptor)
         self._descriptors.clear()
 
-    def _read_chunk(self, place: Place) -> memoryview:
+    def _chunk(self, place: Place) -> memoryview:
+        loaded = self._spans.get(place.path, place.chunk_at, place.chunk_size)
+        if loaded is not None:
+            return loaded
         descriptor = self._descriptors.get(place.path)
         if descriptor is None:
             while len(self._descriptors) >= 8:  # segments are read in order: the oldest is done with
                 os.close(self._descriptors.pop(next(iter(self._descriptors))))
             descriptor = self._descriptors[place.path] = os.open(place.path, os.O_RDONLY)
-        if not self._reuse or len(self._buffer) < place.chunk_size:
-            self._records = memoryview(b"")
-            self._buffer = bytearray(place.chunk_size)
-        chunk = memoryview(self._buffer)[: place.chunk_size]
+        chunk = memoryview(bytearray(place.chunk_size))
         _read_fully(descriptor, chunk, place.chunk_at)
-        return _records_of_chunk(chunk)
+        return chunk
 
 
 def _chunks_of_summary(path: Path, channels: dict[int, str]) -> list[tuple[int, int]] | None:
@@ -283,6 +288,7 @@ class _Descriptor:
 
     def __enter__(self) -> int:
         self._descriptor = os.open(self._path, os.O_RDONLY)
+        os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_RANDOM)  # heads only: nothing is to be read ahead
         return self._descriptor
 
     def __exit__(self, *_: object) -> None:

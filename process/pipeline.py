@@ -6,7 +6,8 @@ depend on how many processes made it.
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -18,10 +19,10 @@ import pyarrow as pa
 from capture.errors import ProcessError
 from process.bulb import centres_m, wing_normals
 from process.camera_model import MarkerLayout, Rig, RigSide
-from process.detect import Detections, DetectSettings, detect
+from process.detect import Detections, DetectSettings, detect_all
 from process.flight_cameras import check_cameras
 from process.fuselage_lights import without_lights
-from process.match import UNSEEN, Matches, MatchSettings, Track, match
+from process.match import UNSEEN, Matches, MatchSettings, Sighting, Track, match_sighting, sightings
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
 from process.set_time import marker_instants_ns, ptp_state, set_instant_ns, time_sigma_ns
 from process.tables import MARKER_SCHEMA
@@ -29,6 +30,7 @@ from process.triangulate import Method, triangulate_as
 from process.workers import Shared, crew, usable_cores
 
 BLOCK_TRIGGERS = 50
+GROUP_SETS = 5  # measured together: reads are large, and what a call costs is shared
 BLOCKS_WORTH_A_PROCESS = 4  # starting one costs as much as processing a block or two
 Progress = Callable[[int, int], None]
 
@@ -92,7 +94,7 @@ class _Rows:
 
     columns: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in MARKER_SCHEMA.names})
     problems: list[str] = field(default_factory=list)
-    rejected: dict[str, int] = field(default_factory=dict)
+    rejected: Counter[str] = field(default_factory=Counter)
 
 
 def markers(
@@ -164,34 +166,69 @@ def measure_block(job: BlockJob) -> BlockResult:
     rig, settings = job.how.get()
     into = _Rows()
     track: Track | None = None
-    with FrameSetReader(reuse=True) as reader:
-        for where in job.block.places:
-            frames = reader.read(where)
-            into.problems.extend(frames.problems)
-            if all(moment is None for moment in frames.mid_exposures_ns):
-                continue  # no frame could be read, so there is no time either: it is in the problems
-            track = _process_set(into, frames, rig, settings, track)
-    return BlockResult(_table(into), len(job.block.places), tuple(into.problems), into.rejected)
+    for some in _loaded(job.block.places):
+        into.problems.extend(problem for frames in some for problem in frames.problems)
+        # without any frame there is no time either: it is in the problems
+        timed = [frames for frames in some if any(moment is not None for moment in frames.mid_exposures_ns)]
+        track = _process_sets(into, timed, rig, settings, track)
+    return BlockResult(_table(into), len(job.block.places), tuple(into.problems), dict(into.rejected))
 
 
-def _process_set(
-    into: _Rows, frames: FrameSet, rig: Rig, settings: PipelineSettings, track: Track | None
+def _loaded(places: Sequence[SetPlaces]) -> Iterator[list[FrameSet]]:
+    """The frame sets, GROUP_SETS at a time, valid until the next; the next ones' bytes are on their way meanwhile."""
+    groups = [places[begin : begin + GROUP_SETS] for begin in range(0, len(places), GROUP_SETS)]
+    with FrameSetReader() as one, FrameSetReader() as other, ThreadPoolExecutor(1, "read-ahead") as ahead:
+        waiting = ahead.submit(one.load, groups[0])
+        for number, group in enumerate(groups):
+            reader, following = (one, other) if number % 2 == 0 else (other, one)
+            waiting.result()
+            if number + 1 < len(groups):
+                waiting = ahead.submit(following.load, groups[number + 1])
+            yield [reader.read(where) for where in group]
+
+
+def _process_sets(
+    into: _Rows, sets: Sequence[FrameSet], rig: Rig, settings: PipelineSettings, track: Track | None
 ) -> Track | None:
-    side = rig.side(frames.side)
-    _check_size(frames, side)
-    if frames.images[0] is None or frames.images[1] is None:
-        count = 2 * len(rig.markers.pairs_station_m)
-        _append(into, frames, side, _unseen(count), None, settings, rig.markers)
-        return track
-    found = (detect(frames.images[0], settings.detection), detect(frames.images[1], settings.detection))
-    for spots in found:
-        for rejected in spots.rejected:
-            reason = rejected.reason.split(":")[0]
-            into.rejected[reason] = into.rejected.get(reason, 0) + 1
-    found = without_lights(side, found)
-    matched = match(frames.side, side, rig.markers, found, frames.trigger_index, track, settings.matching)
-    _append(into, frames, side, matched, found, settings, rig.markers)
-    return matched.track or track
+    """Add the rows of some sets of one side; returns what the next ones' matching starts from."""
+    whole = []
+    images = []
+    for frames in sets:
+        _check_size(frames, rig.side(frames.side))
+        image0, image1 = frames.images
+        if image0 is not None and image1 is not None:
+            whole.append(frames)
+            images += [image0, image1]
+    spots = detect_all(images, settings.detection)
+    for found in spots:
+        into.rejected.update(rejected.reason.split(":")[0] for rejected in found.rejected)
+    seen = _sightings(whole, spots, rig, settings)
+    for frames in sets:
+        side = rig.side(frames.side)
+        sighting = seen.get(frames.trigger_index)
+        if sighting is None:
+            count = 2 * len(rig.markers.pairs_station_m)
+            _append(into, frames, side, _unseen(count), None, settings, rig.markers)
+            continue
+        matched = match_sighting(
+            frames.side, side, rig.markers, sighting, frames.trigger_index, track, settings.matching
+        )
+        _append(into, frames, side, matched, sighting.detections, settings, rig.markers)
+        track = matched.track or track
+    return track
+
+
+def _sightings(
+    whole: Sequence[FrameSet], spots: Sequence[Detections], rig: Rig, settings: PipelineSettings
+) -> dict[int, Sighting]:
+    """By trigger index, of sets with both frames, of which ``spots`` were found in turn."""
+    if not whole:
+        return {}
+    name = whole[0].side
+    side = rig.side(name)
+    pairs = [without_lights(side, pair) for pair in zip(spots[0::2], spots[1::2], strict=True)]
+    found = sightings(name, side, rig.markers, pairs, settings.matching)
+    return {frames.trigger_index: one for frames, one in zip(whole, found, strict=True)}
 
 
 def _check_size(frames: FrameSet, side: RigSide) -> None:
@@ -230,7 +267,10 @@ def _append(
         spots = matched.spot0[rows], matched.spot1[rows]
         pixels[0, rows], pixels[1, rows] = found[0].pixels[spots[0]], found[1].pixels[spots[1]]
         assert matched.rays is not None
-        points = triangulate_as(settings.triangulation, side, matched.rays[0][spots[0]], matched.rays[1][spots[1]])
+        points = matched.points
+        if points is None or settings.triangulation != "default":
+            rays = matched.rays[0][spots[0]], matched.rays[1][spots[1]]
+            points = triangulate_as(settings.triangulation, side, *rays)
         numbers["xyz"][rows], numbers["cov"][rows] = points.xyz_m, points.covariance_m2
         if layout.light.dome_radius_m > 0.0:
             normals = wing_normals(frames.side, layout, numbers["xyz"])

@@ -64,17 +64,20 @@ class Recording:
 
 
 class FrameSetReader:
-    """Reads frame sets from their places. With ``reuse``, a set's images are valid until the next one is read."""
+    """Reads frame sets from their places."""
 
-    def __init__(self, *, reuse: bool = False) -> None:
-        self._readers = tuple(ChunkReader(reuse=reuse) for _ in CAMERAS)
+    def __init__(self) -> None:
+        self._reader = ChunkReader()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for reader in self._readers:
-            reader.close()
+        self._reader.close()
+
+    def load(self, sets: Sequence[SetPlaces]) -> None:
+        """Read the bytes of several sets at once; images of the sets loaded before are no longer valid."""
+        self._reader.load(place for one in sets for place in (*one.images, *one.frames) if place is not None)
 
     def read(self, places: SetPlaces) -> FrameSet:
         """The frame set; a frame that fails its CRC is None, and told in ``problems``.
@@ -86,14 +89,14 @@ class FrameSetReader:
         frames: list[Frame | None] = [None, None]
         times_ns: list[int | None] = [None, None]
         problems = []
-        for camera, reader in enumerate(self._readers):
+        for camera in range(len(CAMERAS)):
             image_place, frame_place = places.images[camera], places.frames[camera]
             if image_place is None:
                 continue
             try:
-                if frame_place is not None:  # before the image, which must be the last that a reused buffer holds
-                    frames[camera] = Frame.decode(reader.read(frame_place))
-                images[camera], stamp_ns = _read_image(reader, image_place)
+                if frame_place is not None:
+                    frames[camera] = Frame.decode(self._reader.read(frame_place))
+                images[camera], stamp_ns = _read_image(self._reader, image_place)
                 frame = frames[camera]
                 times_ns[camera] = stamp_ns if frame is None else frame.mid_exposure_ns
             except (ValueError, OSError) as error:

@@ -63,7 +63,7 @@ def parse_window(text: str, option: str) -> Window:
 
 def within(recording: Recording, window: Window) -> Recording:
     """The recording's frame sets of the window. Raises ProcessError when it has none there."""
-    with FrameSetReader(reuse=True) as reader:
+    with FrameSetReader() as reader:
 
         def instant_ns(places: SetPlaces) -> int:
             times = [moment for moment in reader.read(places).mid_exposures_ns if moment is not None]

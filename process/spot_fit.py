@@ -11,7 +11,9 @@ sensor, σ_b² + g A f: background noise and shot noise (g grey levels an electr
 Levenberg–Marquardt on their pixels laid end to end.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,12 +47,17 @@ class Patches:
     """(K,) grey levels"""
     counts: NDArray[np.intp]
     """(N,) pixels of each spot, none zero"""
-    background_sigma: float
-    """standard deviation of the background, grey levels"""
+    background_sigma: Array
+    """(N,) standard deviation of the background of each spot's image, grey levels"""
     shot_gain: float
     """grey levels an electron"""
     saturation: float
     """grey level from which a value only says "at least this much" """
+
+    @cached_property
+    def background_variance(self) -> Array:
+        """(K,) of each pixel, but for the light."""
+        return self.spread(self.background_sigma**2)
 
     def spread(self, per_spot: Array) -> Array:
         """Values (..., N) of the spots to their pixels (..., K)."""
@@ -59,6 +66,27 @@ class Patches:
     def sums(self, per_pixel: Array) -> Array:
         """Sums (..., N) of values (..., K) over each spot."""
         return np.asarray(np.add.reduceat(per_pixel, np.cumsum(self.counts) - self.counts, axis=-1))
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> "Patches":
+        """The patches of some spots (N,)."""
+        pixels = np.repeat(chosen, self.counts)
+        return replace(
+            self,
+            u_px=self.u_px[pixels],
+            v_px=self.v_px[pixels],
+            values=self.values[pixels],
+            counts=self.counts[chosen],
+            background_sigma=self.background_sigma[chosen],
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence["Patches"]) -> "Patches":
+        """The patches of several images, at least one, in their order."""
+        arrays = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("u_px", "v_px", "values", "counts", "background_sigma")
+        }
+        return cls(**arrays, shot_gain=parts[0].shot_gain, saturation=parts[0].saturation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +100,12 @@ class Fit:
     chi2_per_dof: Array
     converged: NDArray[np.bool_]
 
+    def __getitem__(self, chosen: slice) -> "Fit":
+        """Some of the spots."""
+        return Fit(
+            self.parameters[chosen], self.covariance_px2[chosen], self.chi2_per_dof[chosen], self.converged[chosen]
+        )
+
 
 @dataclass(eq=False)
 class _Evaluation:
@@ -80,6 +114,10 @@ class _Evaluation:
     light: Array  # (K,) A f
     jacobian: Array  # (9, K): by the parameters, and the residual
     chi2: Array  # (N,)
+
+    def of(self, spots: NDArray[np.bool_], pixels: NDArray[np.bool_]) -> "_Evaluation":
+        """Of some spots (N,), and their pixels (K,)."""
+        return _Evaluation(self.light[pixels], self.jacobian[:, pixels], self.chi2[spots])
 
 
 def spot_light(parameters: Array, u_px: Array, v_px: Array) -> Array:
@@ -118,9 +156,12 @@ def fit_spots(patches: Patches, start: Array, others: Array | None = None) -> Fi
     """Fit every spot from ``start`` (N, 8).
 
     ``others`` (K,) is light of other spots, to be added to the model. Saturated pixels are censored: they pull only
-    while the model is below saturation. Spots that do not converge say so; nothing is raised.
+    while the model is below saturation. Spots that do not converge say so; nothing is raised. A spot's fit does not
+    depend on which others are fitted with it.
     """
-    others = np.zeros(1) if others is None else others
+    others = np.zeros(len(patches.values)) if others is None else others
+    fitted = Fit(start.copy(), np.full((len(start), 2, 2), np.nan), np.full(len(start), np.nan), start[:, 0] < -np.inf)
+    left = np.arange(len(start))  # the spots that are not settled yet: others no longer take part
     parameters = start.copy()
     prior = _prior(start)
     kept = np.ones(len(patches.values))
@@ -151,12 +192,35 @@ def fit_spots(patches: Patches, start: Array, others: Array | None = None) -> Fi
             parameters = np.where(better[:, None], trial, parameters)
             here = _chosen(patches, better, there, here)
         damping = np.clip(np.where(better, damping * 0.1, damping * 30.0), 1e-6, 1e6)
-        if iteration >= REWEIGHTED_AT and settled.all():
-            break
-    return _finish(patches, parameters, here, weights, prior, moved)
+        if iteration < REWEIGHTED_AT:
+            continue
+        if iteration == ITERATIONS - 1:
+            settled[:] = True
+        if settled.any():
+            pixels = np.repeat(settled, patches.counts)
+            own = patches[settled], parameters[settled], here.of(settled, pixels), weights[pixels]
+            _finish(fitted, left[settled], *own, prior[settled], moved[settled])
+            if settled.all():
+                break
+            stay, pixels = ~settled, ~pixels
+            patches, here = patches[stay], here.of(stay, pixels)
+            others, kept, weights = others[pixels], kept[pixels], weights[pixels]
+            left, start, parameters, prior = left[stay], start[stay], parameters[stay], prior[stay]
+            damping, moved = damping[stay], moved[stay]
+    return fitted
 
 
-def _finish(patches: Patches, parameters: Array, here: _Evaluation, weights: Array, prior: Array, moved: Array) -> Fit:
+def _finish(
+    fitted: Fit,
+    spots: NDArray[np.intp],
+    patches: Patches,
+    parameters: Array,
+    here: _Evaluation,
+    weights: Array,
+    prior: Array,
+    moved: Array,
+) -> None:
+    """Fill in what was ``fitted`` to some spots."""
     information, _ = _normal_equations(patches, here, weights)
     information += prior
     ridge = (1e-9 * _diagonal(information) + 1e-12)[:, None, :] * _EYE
@@ -165,7 +229,10 @@ def _finish(patches: Patches, parameters: Array, here: _Evaluation, weights: Arr
     chi2_per_dof = here.chi2 / dof
     covariance = covariance * np.maximum(chi2_per_dof, LEAST_CHI2)[:, None, None]
     finite = np.isfinite(parameters).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    return Fit(parameters, covariance, chi2_per_dof, finite & (moved < 10 * CONVERGED_PX))
+    fitted.parameters[spots] = parameters
+    fitted.covariance_px2[spots] = covariance
+    fitted.chi2_per_dof[spots] = chi2_per_dof
+    fitted.converged[spots] = finite & (moved < 10 * CONVERGED_PX)
 
 
 def _evaluate(patches: Patches, parameters: Array, others: Array) -> _Evaluation:
@@ -204,7 +271,7 @@ def _chosen(patches: Patches, better: NDArray[np.bool_], there: _Evaluation, her
 
 def _weights(patches: Patches, light: Array, others: Array, kept: Array) -> Array:
     """Inverse variances (K,); 0 for pixels that are not to be used."""
-    return kept / (patches.background_sigma**2 + patches.shot_gain * np.maximum(light + others, 0.0))
+    return kept / (patches.background_variance + patches.shot_gain * np.maximum(light + others, 0.0))
 
 
 def _chi2(patches: Patches, there: _Evaluation, weights: Array) -> Array:
@@ -214,7 +281,7 @@ def _chi2(patches: Patches, there: _Evaluation, weights: Array) -> Array:
 
 def _own_light(patches: Patches, parameters: Array, here: _Evaluation, others: Array) -> Array:
     """(K,) 0 for pixels beside the spot that are 3 σ brighter than it makes them: shine too faint to be a spot."""
-    variance = patches.background_sigma**2 + patches.shot_gain * np.maximum(here.light + others, 0.0)
+    variance = patches.background_variance + patches.shot_gain * np.maximum(here.light + others, 0.0)
     beside = here.light < 0.25 * patches.spread(parameters[:, AMPLITUDE])
     foreign = beside & (here.jacobian[PARAMETERS] > 3.0 * np.sqrt(variance))
     return np.asarray(1.0 - foreign, np.float64)

@@ -44,8 +44,13 @@ class Rays:
     covariance: Array
     """(N, 2, 2)"""
 
-    def __getitem__(self, chosen: NDArray[np.intp]) -> "Rays":
+    def __getitem__(self, chosen: NDArray[np.intp] | slice) -> "Rays":
         return Rays(self.xy[chosen], self.covariance[chosen])
+
+    @classmethod
+    def join(cls, parts: Sequence["Rays"]) -> "Rays":
+        """Those of all ``parts``, at least one, in their order."""
+        return cls(np.concatenate([part.xy for part in parts]), np.concatenate([part.covariance for part in parts]))
 
 
 def rays(camera: CameraModel, pixels: Array, covariance_px2: Array) -> Rays:
@@ -189,17 +194,12 @@ def _reasons(R: Array, t: Array, xy0: Array, xy1: Array, points: Array) -> tuple
     d1 = np.concatenate([xy1, np.ones((len(xy1), 1))], axis=1) @ R
     sine = np.linalg.norm(np.cross(d0, d1), axis=1) / np.linalg.norm(d0, axis=1) / np.linalg.norm(d1, axis=1)
     depth1 = points @ R[2] + t[2]
-    reasons = []
-    for k in range(len(points)):
-        if not np.isfinite(d0[k]).all() or not np.isfinite(d1[k]).all():
-            reasons.append("outside_lens")
-        elif sine[k] < LEAST_PARALLAX or not np.isfinite(points[k]).all():
-            reasons.append("parallel")
-        elif points[k, 2] <= 0.0 or depth1[k] <= 0.0:
-            reasons.append("behind")
-        else:
-            reasons.append("")
-    return tuple(reasons)
+    conditions = [
+        ~(_finite(d0) & _finite(d1)),
+        ~(sine >= LEAST_PARALLAX) | ~_finite(points),
+        (points[:, 2] <= 0.0) | (depth1 <= 0.0),
+    ]
+    return tuple(np.select(conditions, ["outside_lens", "parallel", "behind"], "").tolist())
 
 
 def _normal_equations(

@@ -48,7 +48,7 @@ def windowed_centres(patches: Patches, start: Array) -> Centres:
         with np.errstate(all="ignore"):  # a patch without light: NaN, which does not count as converged
             step = np.clip(2.0 * np.stack([first_u, first_v], axis=1) / total[:, None], -1.0, 1.0)
         centres += step
-    variance = patches.background_sigma**2 + patches.shot_gain * np.maximum(light, 0.0)
+    variance = patches.background_variance + patches.shot_gain * np.maximum(light, 0.0)
     spread = window * window * variance
     uu, vv, uv = patches.sums(np.stack([spread * du * du, spread * dv * dv, spread * du * dv]))
     covariance = np.empty((len(start), 2, 2))

@@ -28,7 +28,7 @@ NOTHING_MEASURED = "no marker was measured in any set; look at the flags column 
 SCALE_SETS = 60  # of a flight, to choose the prior's scale from
 CORRELATION_TIMES = 4.0  # of a stretch's surroundings that smoothing takes into account
 MARGIN_S = 0.05  # markers of a set are at most this far from its instant
-SETS_AT_ONCE = 10  # whose answers to shared errors are in memory
+SETS_AT_ONCE = 50  # whose answers to shared errors are in memory
 
 
 @dataclass(frozen=True)
