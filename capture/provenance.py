@@ -37,6 +37,8 @@ def describe_cameras(cameras: Mapping[str, CameraDescription]) -> dict[str, str]
         "cameras": " ".join(cameras),
         "serials": json.dumps({name: camera.serial for name, camera in cameras.items()}),
         "models": json.dumps({name: camera.model for name, camera in cameras.items()}),
+        "firmware": json.dumps({name: camera.firmware for name, camera in cameras.items()}),
+        "camera_features": json.dumps({name: dict(camera.features) for name, camera in cameras.items()}),
     }
 
 

@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from needs import needs_library
 from network_namespace import network_namespace
 
+from capture.camera.aravis import _Stream, _unwrap
 from capture.camera.aravis_library import LIBRARY
 from capture.camera.base import CameraSettings
 from capture.record import CAMERAS, SIDES, decode_image
@@ -223,3 +224,15 @@ def test_a_killed_recorder_s_cameras_can_be_had_again(gige):
         recorder.communicate()
         time.sleep(0.5)
     assert finished(recorder)["frames_recorded"] == 50
+
+
+def test_network_frame_ids_are_unwrapped():
+    """Block ids of GigE Vision are 16 bit and skip 0; a late frame keeps its own, smaller number."""
+    stream = _Stream(0, wraps=True)
+    ids = [65534, 65535, 1, 2, 65535, 5]
+    assert [_unwrap(stream, frame_id) for frame_id in ids] == [65534, 65535, 65536, 65537, 65535, 65540]
+
+
+def test_usb_frame_ids_do_not_wrap():
+    stream = _Stream(0, wraps=False)
+    assert [_unwrap(stream, frame_id) for frame_id in (65534, 65535, 65537, 200_000)] == [65534, 65535, 65537, 200_000]

@@ -69,3 +69,24 @@ def test_a_disk_that_is_not_mounted_is_not_recorded_beside(write_config, tmp_pat
     (tmp_path / "ssd_right").rmdir()
     with pytest.raises(DiskError, match=r"ssd_right.*mount the disk or make this folder"):
         Recording(load_config(path), SystemClock(), SystemDisk(), lambda _: None).run(StopRule(threading.Event()))
+
+
+@pytest.mark.parametrize(("exposure_us", "warning"), [(999, "faint"), (1000, None), (5000, None), (5001, "saturate")])
+def test_an_exposure_that_does_not_suit_lights_is_told(write_config, rig, exposure_us, warning):
+    path = write_config()
+    path.write_text(path.read_text().replace("exposure_us = 1000", f"exposure_us = {exposure_us}"))
+    found = load_config(path).config.exposure_warning
+    assert (found is None) == (warning is None)
+    if warning is not None:
+        assert warning in found
+        assert f"{exposure_us} us" in found
+
+
+def test_what_a_camera_is_asked_to_be_comes_from_the_configuration(write_config, rig):
+    path = write_config()
+    keys = 'black_level = 1.5\nshutter_mode = "Rolling"\noffset_y = 8\n'
+    keys += 'trigger_line = "Line2"\ntrigger_activation = "FallingEdge"'
+    path.write_text(path.read_text().replace("exposure_us = 1000", f"exposure_us = 1000\n{keys}"))
+    settings = load_config(path).config.settings
+    assert (settings.black_level, settings.shutter_mode, settings.offset_y) == (1.5, "Rolling", 8)
+    assert (settings.trigger_line, settings.trigger_activation) == ("Line2", "FallingEdge")
