@@ -18,7 +18,8 @@ from capture.clock import SystemClock
 from capture.companions import make_companions
 from capture.config import load_config
 from capture.console import Narrator, run, say, say_json
-from capture.daemon import Recording, RecordingResult, StopRule
+from capture.control_command import controlled, start, stop
+from capture.daemon import Recording, RecordingResult
 from capture.devices_command import devices
 from capture.disk import SystemDisk
 from capture.errors import CaptureError, UsageError
@@ -32,8 +33,12 @@ from capture.notify import Notifier, journal_listens
 from capture.preflight import preflight as run_checks
 from capture.recover import recover_flight
 from capture.service import Service
+from capture.session import Session
+from capture.trigger import is_running
 from capture.unfinished import AfterPower
 from capture.verify import FlightReport, inspect
+from capture.vitals import idle_health
+from capture.watchdog import IDLE
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -53,21 +58,34 @@ def record(
     duration: Annotated[float, typer.Option(min=0, help="end after this many seconds (0: no limit)")] = 0.0,
     json: Json = False,
 ) -> None:
-    """Record until SIGTERM, Ctrl-C, or the given number of triggers or seconds."""
-    requested = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, lambda *_: requested.set())
+    """Record until SIGTERM, Ctrl-C, or the given number of triggers or seconds.
+
+    What begins a recording is `start.on` of the configuration. After `wingcap stop` it waits for `wingcap start`.
+    """
     loaded, clock = load_config(config), SystemClock()
     disks = (loaded.config.disks.left, loaded.config.disks.right)
     service = Service(loaded.config, clock, Journal() if journal_listens() else Narrator(), Notifier())
     if service.managed:  # the watchdog's SIGABRT then says where each thread stood
         faulthandler.enable()
-    companions = [*make_companions(loaded.config, clock), AfterPower(disks)]
     with sole_recorder(disks), HealthWriter(loaded.config, clock, service.event) as health:
-        recording = Recording(loaded, clock, SystemDisk(), service.event, companions, health, service)
-        service.event(f"recording {recording.flight}")
-        result = recording.run(StopRule(requested, triggers, duration))
+
+        def make() -> Recording:
+            companions = [*make_companions(loaded.config, clock), AfterPower(disks)]
+            return Recording(loaded, clock, SystemDisk(), service.event, companions, health, service)
+
+        def idle() -> None:
+            health.source = idle_health
+            service.look(IDLE)
+
+        session = Session(loaded.config.start, make, service.event, idle)
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, lambda *_: threading.Thread(target=session.quit).start())  # it may wait for a lock
+        with controlled(session.act, health, service.event):
+            in_flight = loaded.config.start.on == "command" and is_running(loaded.config.trigger.port, clock)
+            result = session.run(triggers, duration, in_flight)
     service.close()
+    if result is None:
+        return
     if json:
         say_json(result.as_dict())
     elif service.managed:
@@ -105,6 +123,8 @@ def preflight(
 
 
 app.command()(devices)
+app.command()(start)
+app.command()(stop)
 
 
 @app.command()

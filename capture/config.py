@@ -53,6 +53,13 @@ class DiskConfig(_Table):
     takeover: bool = False  # when a disk fails, its side goes on on the other one
 
 
+class StartConfig(_Table):
+    """What starts a recording, and what is tried just before it."""
+
+    on: Literal["power-up", "command", "first-trigger"] = "power-up"
+    burst: Annotated[int, Field(ge=0, le=100)] = 0  # triggers of the test burst; 0: none
+
+
 class RingConfig(_Table):
     """How long a disk may stall before a frame is lost for want of room."""
 
@@ -185,6 +192,7 @@ class Config(_Table):
     health: HealthConfig = HealthConfig()
     ptp: PtpConfig | None = None
     threads: ThreadsConfig = ThreadsConfig()
+    start: StartConfig = StartConfig()
     flight: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     calibration: Path | None = None
     can: list[CanConfig] = []

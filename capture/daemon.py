@@ -11,6 +11,7 @@ from typing import Any
 
 from capture.analog import AnalogLog
 from capture.aux_log import AuxLog, Companion
+from capture.burst import give_burst, judge_burst
 from capture.camera.base import Camera, CameraDescription
 from capture.camera_place import camera_at, open_at
 from capture.clock import Clock
@@ -167,11 +168,13 @@ class Recording:
                     companion.start(self._aux.put)
                 if self._analog is not None:
                     self._analog.begin(run.board)
-                for lane in self._lanes.values():
-                    lane.start()
-                run.begin(stop.triggers)
-                self._vitals.begin(self._lanes)
-                self._control(run, stop, started_s)
+                if self._may_begin(run, stop):
+                    for lane in self._lanes.values():
+                        lane.start()
+                    started_s = self._clock.monotonic_s()
+                    run.begin(stop.triggers)
+                    self._vitals.begin(self._lanes)
+                    self._control(run, stop, started_s)
             except Exception as error:  # whatever it is: what was recorded is closed and accounted for
                 self._failures.append(f"{type(error).__name__}: {error}")
             self._vitals.state = "stopping"
@@ -181,6 +184,32 @@ class Recording:
                 companion.stop()
             seconds = self._clock.monotonic_s() - started_s
             return self._finish(count, seconds, run)
+
+    @property
+    def state(self) -> str:
+        """``starting``, ``armed``, ``test burst``, ``recording``, ``stopping`` or ``ended``."""
+        return self._vitals.state
+
+    def _may_begin(self, run: TriggerRun, stop: StopRule) -> bool:
+        """Wait, armed, for what starts the recording, and try the triggers; False: told to stop before."""
+        start = self._config.start
+        self._vitals.state = "armed"
+        while start.on == "first-trigger" and not run.in_flight and not run.strays:
+            if stop.requested.wait(CONTROL_PERIOD_S):
+                return False
+            self._flush_aux()
+            if self._service is not None:
+                self._service.look(IDLE)
+        if start.burst and not run.in_flight:
+            self._vitals.state = "test burst"
+            rate_hz = self._config.trigger.rate_hz
+            judge_burst(
+                self._gates,
+                lambda: give_burst(self._cameras, run.board, run.strays, start.burst, rate_hz, self._clock),
+                list(self._cameras),
+                self._config.camera.time_sigma_limit_us,
+            )
+        return not stop.requested.is_set()
 
     def _make_run(self) -> TriggerRun:
         return TriggerRun(

@@ -3,15 +3,23 @@
 A check changes nothing for good and takes seconds. The table ``CHECKS`` is the order in which they run.
 """
 
+import contextlib
 import datetime
 from collections.abc import Iterator, Mapping
 
+from capture.burst import give_burst
+from capture.camera.base import Camera, CameraDescription
 from capture.camera_checks import check_calibration, check_cameras, check_usb
+from capture.camera_place import camera_at, open_at
 from capture.clock import EARLIEST_NS
 from capture.errors import CaptureError
 from capture.finding import Check, Finding, Situation
+from capture.ledger import Place
 from capture.ptp import POLL_S, PtpWatch
 from capture.trigger import TriggerBoard
+from capture.trigger_protocol import Pulse
+
+BURST = 10  # triggers, where the configuration does not say
 
 PTP_REMEDIES = {
     "ptp.answers": "see `journalctl -u ptp4l`",
@@ -67,6 +75,42 @@ def check_board(situation: Situation) -> list[Finding]:
     return [Finding("trigger board", True, found, numbers=numbers)]
 
 
+def check_burst(situation: Situation) -> list[Finding]:
+    """A few triggers: board and cameras count the same, and each frame's instant can be told well enough."""
+    config = situation.config
+    pulses: list[Pulse] = []
+    with contextlib.ExitStack() as cleanup:
+        board = TriggerBoard(config.trigger.port, situation.clock, lambda pulse, trigger: pulses.append(pulse))
+        cleanup.callback(board.close)
+        board.start()
+        if board.status()[0]:
+            remedy = "stop whoever started it; a board that was left running stops at the next recording"
+            return [Finding("test burst", False, f"{board.port}: the board is giving triggers already", remedy)]
+        cameras: dict[Place, tuple[Camera, CameraDescription]] = {}
+        for place in config.cameras:
+            camera = camera_at(config, place)
+            cleanup.callback(camera.close)
+            cameras[place.side, place.name] = (camera, open_at(camera, config, place))
+        count = config.start.burst or BURST
+        found = give_burst(cameras, board, pulses, count, config.trigger.rate_hz, situation.clock)
+    told = found.given == found.reported == count
+    findings = [
+        Finding(
+            "test burst",
+            told,
+            f"asked for {count} triggers, the board gave {found.given} and reported {found.reported}",
+            "" if told else "check the board's firmware and its serial line",
+            {"asked": count, "given": found.given, "reported": found.reported},
+        )
+    ]
+    for key, seen in found.cameras.items():
+        trouble = found.trouble(key, config.camera.time_sigma_limit_us)
+        good = f"{seen.frames} frames of {found.given} triggers, instants known to {seen.sigma_us:.1f} us"
+        remedy = "check its trigger cable, exposure and rate" if trouble else ""
+        findings.append(Finding(f"test burst {'/'.join(key)}", trouble is None, trouble or good, remedy, vars(seen)))
+    return findings
+
+
 CHECKS: Mapping[str, Check] = {
     "clock": check_clock,
     "ptp": check_ptp,
@@ -74,6 +118,7 @@ CHECKS: Mapping[str, Check] = {
     "usb": check_usb,
     "cameras": check_cameras,
     "calibration": check_calibration,
+    "test burst": check_burst,
 }
 
 

@@ -294,3 +294,18 @@ class TriggerBoard(Worker):
         except ValueError as error:
             raise TriggerBoardError(f"{self.port}: the board's counts are no numbers: {' '.join(words)}") from error
         return BoardCount(next_index, counter)
+
+
+def is_running(port: str, clock: Clock) -> bool:
+    """Whether a board there is giving triggers; False too where no board can be asked."""
+    try:
+        board = TriggerBoard(port, clock, lambda pulse, trigger: None)
+    except TriggerBoardError:
+        return False
+    try:
+        board.start()
+        return board.status()[0]
+    except TriggerBoardError:
+        return False
+    finally:
+        board.close()

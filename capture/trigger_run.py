@@ -25,6 +25,7 @@ DRAIN_S = 0.2  # how long frames of a reset board's last pulses may be on their 
 STRANGE_NS = 1_000_000_000  # a board whose clock is further from the computer's is not on its time
 GATE = "trigger board"
 LATE_KEPT = 64
+STRAYS_KEPT = 256
 _SEEN_KEPT = 4096
 
 
@@ -73,6 +74,8 @@ class TriggerRun:
         """
         self.trouble = ""  # why the final count is not confirmed
         self.resets = 0
+        self.strays: deque[Pulse] = deque(maxlen=STRAYS_KEPT)  # pulses that are none of this recording's
+        self.in_flight = False  # the board was running when we came: for a recorder that was killed
         self.duplicates = 0  # reports that came twice
         self.contradictions = 0  # reports of which one of index, counter and time was wrong
         self.unbelieved = 0  # reports that no two of them agreed on
@@ -85,7 +88,7 @@ class TriggerRun:
         self._on_restart = on_restart
         self.board = TriggerBoard(config.port, clock, self._on_pulse, on_sample)
         self._epoch: _Epoch | None = None
-        self._count = 0
+        self._count, self._begun = 0, False
         self._last: _Report | None = None
         self._fresh_epoch = False  # no pulse of it yet: the time since the last one is no step of a clock
         self._late_ns: deque[int] = deque(maxlen=LATE_KEPT)
@@ -98,13 +101,15 @@ class TriggerRun:
         """Talk to the board, which may still be running for a recorder that was killed; its name."""
         self.board.start()
         name = self.board.hello()
+        self.in_flight = self.board.status()[0]
         self._stop_and_count()
         self.board.set_rate(self._config.rate_hz)
+        self.strays.clear()
         return name
 
     def begin(self, count: int) -> None:
         """Give pulses from the configured index on, ``count`` of them or without end."""
-        self._count = count
+        self._count, self._begun = count, True
         self._heard_s = self._clock.monotonic_s()
         self._boots = self.board.boots
         self._start(self._config.first_index, self._stop_and_count())
@@ -141,6 +146,9 @@ class TriggerRun:
         except TriggerBoardError as error:
             self.trouble = str(error)
             return None
+        if not self._begun:
+            self._epoch = _Epoch(self._config.first_index, count.counter)
+            return BoardCount(self._config.first_index, count.counter)
         if self._goes_on(count):
             return count
         self.trouble = f"{self.board.port}: the board's last count ({count.counter}) is not that of its pulses"
@@ -218,7 +226,8 @@ class TriggerRun:
         """A report, in the board's reading thread."""
         epoch = self._epoch
         if epoch is None:
-            return  # of a recording before ours
+            self.strays.append(pulse)
+            return
         now_s = self._clock.monotonic_s()
         trusted = abs(pulse.actual_ns - trigger.receive_time_ns) < STRANGE_NS
         time_ns = pulse.actual_ns if trusted else trigger.receive_time_ns

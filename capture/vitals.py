@@ -29,7 +29,8 @@ HUNG_DRIVER_S = 2.0
 LOSING_SHARE = 0.01  # of a camera's triggers within the window
 RING_BEHIND_SHARE = 0.5
 MINUTES_LOW, MINUTES_LEAST = 10.0, 2.0
-RUNNING = ("armed", "recording")
+RUNNING = ("armed", "test burst", "recording")
+IDLE = "idle"
 _AFTER_ARRIVAL = tuple(stage.name.lower() for stage in (LossStage.RING, LossStage.WRITER, LossStage.DISK))
 
 
@@ -54,6 +55,12 @@ class _Sample:
     def counts(self) -> dict[object, int]:
         """What rises while all is well."""
         return dict([("triggers", self.triggers), *self.arrived.items(), *self.written.items()])
+
+
+def idle_health() -> Health:
+    """Of a recorder that waits to be told to record."""
+    notice = Notice(ERROR, "recorder", f"not recording, {IDLE}: `wingcap start` begins")
+    return Health("", IDLE, 0.0, 0, 0.0, (), (), (notice,))
 
 
 class Vitals:
