@@ -19,6 +19,7 @@ class AnalogLog:
 
     def __init__(self, config: AnalogConfig, clock: Clock) -> None:
         self.samples = 0
+        self.messages = 0  # one for each configured channel of a sample
         self.lost = 0  # lines with a sample that did not come, or came garbled
         self._config = config
         self._clock = clock
@@ -62,6 +63,7 @@ class AnalogLog:
             value = channel.scale * volts + channel.offset
             message = Analog(sample.time_ns, now_ns, sample.number, channel.channel, channel.name, volts, value)
             put(ANALOG_TOPIC, sample.time_ns, message.encode())
+            self.messages += 1
 
     def statuses(self) -> list[Diagnostic]:
         """One line: refused, silent, lacking a channel, losing lines, or in order."""
@@ -86,4 +88,5 @@ class AnalogLog:
 
     def account(self) -> dict[str, str]:
         """Samples taken and lost."""
-        return {f"{NAME}.samples": str(self.samples), f"{NAME}.lost": str(self.lost)}
+        counts = {"samples": self.samples, "messages": self.messages, "lost": self.lost}
+        return {f"{NAME}.{what}": str(count) for what, count in counts.items()}

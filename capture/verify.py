@@ -10,6 +10,7 @@ from typing import Any
 
 from capture.errors import RecordingError, UsageError
 from capture.flight import find_folders
+from capture.other_books import OtherBooks
 from capture.record import LOSS_TOPIC, SIDES, TRIGGER_TOPIC, Frame, Loss, Trigger, decode_image
 from capture.scan import Scan, ScannedMessage, scan
 
@@ -121,6 +122,7 @@ def inspect(paths: Sequence[Path]) -> FlightReport:
     _demand_one_flight(report.folders)
     pulses: dict[int, Trigger] = {}
     ends: list[dict[str, str]] = []
+    books = OtherBooks()
     for folder in report.folders:
         for path in sorted(folder.glob("*.mcap")):
             try:
@@ -130,13 +132,17 @@ def inspect(paths: Sequence[Path]) -> FlightReport:
                 continue
             for message in messages:
                 _take(report, path, message, pulses)
+                books.take(path, message.topic)
             report.files.append(found)
             report.problems += [f"{path}: {problem}" for problem in found.problems]
             if "wingshape_end" in found.metadata:
                 ends.append(found.metadata["wingshape_end"])
+                books.close(path, found.metadata["wingshape_end"])
             report.provenance = report.provenance or found.provenance
     _check_sides(report)
     _check_books(report, pulses, ends)
+    report.problems += books.problems
+    report.notes += books.notes
     return report
 
 

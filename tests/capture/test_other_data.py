@@ -369,7 +369,7 @@ def test_lost_samples_are_counted_and_a_missing_channel_is_said():
     analog.start(Log().put)
     for number in (0, 1, 4, 5, 0, 1):  # two lines lost; then the board was set up anew
         analog.take(Sample(number, 0, (0.0,)))
-    assert analog.account() == {"analog.samples": "6", "analog.lost": "2"}
+    assert analog.account() == {"analog.samples": "6", "analog.messages": "0", "analog.lost": "2"}
     analog._trouble = ""
     assert "no channel 3" in analog.statuses()[0].message
 
@@ -409,7 +409,9 @@ def test_a_recording_has_them_and_goes_on_without_those_that_are_missing(write_c
     done.set()
     speaking.join()
     assert (result.lost, result.failures) == (0, []), result.as_dict()
-    assert inspect([tmp_path]).problems == []
+    report = inspect([tmp_path])
+    assert report.problems == []
+    assert [note for note in report.notes if note.startswith("can.missing: was gone 1 times")] != []
     aux = tmp_path / "ssd_left/test/aux_0000.mcap"
     with aux.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -435,6 +437,37 @@ def test_a_recording_has_them_and_goes_on_without_those_that_are_missing(write_c
         counts = {connection.topic: connection.msgcount for connection in bag.connections}
     assert counts[CAN_TOPIC] == len(numbers)
     assert counts[MAVLINK_TOPIC] == int(end["mavlink.messages"])
+
+
+def test_messages_that_are_not_there_are_a_problem_of_the_recording(write_config, rig, tmp_path, monkeypatch):
+    """One in ten is dropped on the way to the disk, behind the recorder's back."""
+    path = write_config(rate_hz=50.0)
+    path.write_text(path.read_text() + '[[can]]\nname = "bus"\ninterface = "virtual"\nchannel = "leaky"\n')
+    real, calls = AuxLog.put, itertools.count()
+
+    def leaky(self: AuxLog, topic: str, time_ns: int, data: bytes) -> None:
+        if topic != CAN_TOPIC or next(calls) % 10:
+            real(self, topic, time_ns, data)
+
+    monkeypatch.setattr(AuxLog, "put", leaky)
+    loaded = load_config(path)
+    done = threading.Event()
+
+    def speak() -> None:
+        with can.Bus(interface="virtual", channel="leaky") as bus:
+            while not done.wait(0.005):
+                bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+
+    speaking = threading.Thread(target=speak)
+    speaking.start()
+    Recording(loaded, CLOCK, SystemDisk(), lambda _: None, make_companions(loaded.config, CLOCK)).run(
+        StopRule(threading.Event(), 25)
+    )
+    done.set()
+    speaking.join()
+    problems = inspect([tmp_path]).problems
+    assert len(problems) == 2  # on each disk
+    assert all("messages on /can, the recorder counted" in problem for problem in problems)
 
 
 @pytest.mark.parametrize(
