@@ -58,13 +58,22 @@ class AravisCamera(Camera):
             self._lost.value = 0
             device = library.call("arv_camera_get_device", self._camera)
             self._lost_handler = library.count_signal(device, "control-lost", self._lost)
+            if library.call("arv_camera_is_gv_device", self._camera) and not library.call(
+                "arv_gv_device_is_controller", device
+            ):
+                raise CameraError(
+                    f"{self.address}: another program has the camera: close that; of one that was killed, the camera "
+                    "lets go after its heartbeat (about 3 s)"
+                )
             if library.call("arv_camera_is_uv_device", self._camera):
                 library.call("arv_camera_uv_set_usb_mode", self._camera, library.usb_mode)
             self._features = Features(library, self._camera, self.address)
             return self._features.configure(self.settings, is_fake=self.address.startswith(FAKE))
-        except CameraError:
+        except CameraError as error:
             self.close()
-            raise
+            if str(error).startswith(self.address):
+                raise
+            raise CameraError(f"{self.address}: {error}: check its cable and power") from error
 
     def queue(self, slot: int, buffer: memoryview) -> None:
         """Give the driver an empty buffer, to be filled in place."""

@@ -22,6 +22,8 @@ HARNESSES = {
 """By name: module in tests/support and class."""
 IN_THE_VM = ("usb3", "v4l2")
 """Those that need a kernel of their own: run in the guest of tests/vm, by WINGSHAPE_HARNESSES=usb3,v4l2."""
+SLOW = ("aravis-gige",)
+"""Those with timeouts of seconds: run with the slow tests."""
 
 
 class Harness(ABC):

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from camera_harness import Harness, make_harness, wanted_harnesses
+from camera_harness import SLOW, Harness, make_harness, wanted_harnesses
 
 from capture.camera import make_camera
 from capture.camera.base import Camera, CameraDescription, Grab
@@ -90,7 +90,9 @@ class Bench:
             self.camera.grab(0.1)
 
 
-@pytest.fixture(params=wanted_harnesses())
+@pytest.fixture(
+    params=[pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in wanted_harnesses()]
+)
 def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     with make_harness(request.param) as harness:
         bench = Bench(harness)
