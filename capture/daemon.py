@@ -162,6 +162,7 @@ class Recording:
             run.board.placement = self._config.threads.control
             self._make_lanes(run.open())
             self._show_frames()
+            self._step()
             started_s = self._clock.monotonic_s()
             try:
                 for companion in self._companions:
@@ -258,6 +259,7 @@ class Recording:
             camera = camera_at(self._config, place)
             cleanup.callback(camera.close)
             self._cameras[place.side, place.name] = (camera, open_at(camera, self._config, place))
+            self._step()
 
     def _make_lanes(self, board_name: str) -> None:
         parts = LaneParts(
@@ -384,6 +386,10 @@ class Recording:
                 self._failures.append(f"{'/'.join(place)}: the books do not balance: {account}")
         self._write_metadata()
         return self._result(next_index - self._config.trigger.first_index, seconds, run.board.garbled_lines)
+
+    def _step(self) -> None:
+        if self._service is not None:
+            self._service.step()
 
     def _look(self) -> None:
         if self._service is not None:

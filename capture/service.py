@@ -8,7 +8,7 @@ from capture.console import Narrator
 from capture.journal import PROGRESS_PERIOD_S, Changes, Journal
 from capture.notify import Notifier
 from capture.record import Diagnostic
-from capture.watchdog import Progress, Watchdog, watchdog_s
+from capture.watchdog import IDLE, Progress, Watchdog, watchdog_s
 
 
 class Service:
@@ -50,6 +50,11 @@ class Service:
                 self._voice.write(priority, text, name)
             else:
                 self._voice(text)
+
+    def step(self) -> None:
+        """One step of a recording's start is done. Where an earlier one has said that we are ready, that is life."""
+        if self._ready:
+            self._watchdog.look(IDLE)
 
     def look(self, progress: Progress) -> None:
         """The recording is at work, or rightly idle. The first time says that the service is ready."""

@@ -30,9 +30,9 @@ def watchdog_s(config: Config) -> float:
 
     The longest healthy silence: the disk stalls for as long as the ring bridges (``ring.stall_s``), the control
     thread waits for a board that answers at its last chance, and the cameras' first frames are held back until
-    there are enough to be numbered.
+    there are enough to be numbered. Or, before a recording: the test burst.
     """
-    held_back_s = (CONFIRMING + 1) / config.trigger.rate_hz + FIRST_REPORT_WAIT_S
+    held_back_s = (CONFIRMING + 1 + config.start.burst) / config.trigger.rate_hz + FIRST_REPORT_WAIT_S
     return max(LEAST_S, MARGIN * (config.ring.stall_s + BOARD_ANSWER_S + held_back_s + SIGN_PERIOD_S))
 
 

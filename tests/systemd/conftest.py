@@ -29,7 +29,7 @@ def recorder_config(extra: str = "") -> str:
         for side, name in itertools.product(("left", "right"), ("cam0", "cam1"))
     )
     return (
-        '[trigger]\nport = "/run/rig/trigger"\n'
+        '[trigger]\nport = "/run/rig/trigger"\n[ptp]\nsocket = "/run/wingshape-ptp/ptp4l"\n'
         '[disks]\nleft = "/mnt/ssd_left"\nright = "/mnt/ssd_right"\nreserve_mb = 5\nsegment_mb = 20\n'
         "[ring]\nstall_s = 0.5\n"
         "[threads]\nread_priority = 40\nwrite_priority = 30\ncontrol_priority = 20\nwrite_cpus = [1]\n"
@@ -51,10 +51,23 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
         write(found, "etc/wingshape/wingcap.toml", recorder_config())
         if not may_raise_limits():
             write(found, "etc/systemd/system/wingcap.service.d/rights.conf", RIGHTS)
+        write(found, "etc/systemd/system/wingshape-ptp4l.service.d/rights.conf", PTP_RIGHTS)
+        write(found, "etc/wingshape/ptp.env", "PTP_INTERFACE=lo\n")
+        ptp = found.root / "etc/wingshape/ptp4l.conf"
+        ptp.write_text(ptp.read_text().replace("time_stamping hardware", "time_stamping software"))
         found.ask("systemctl", "daemon-reload")
         found.ask("systemctl", "start", "rig")
         wait_for(lambda: found.run("test", "-S", "/run/rig/rig.sock").returncode == 0, 20.0)
         yield found
+
+
+PTP_RIGHTS = """[Service]
+AmbientCapabilities=
+AmbientCapabilities=CAP_NET_ADMIN CAP_NET_BIND_SERVICE CAP_NET_RAW
+CapabilityBoundingSet=
+CapabilityBoundingSet=CAP_NET_ADMIN CAP_NET_BIND_SERVICE CAP_NET_RAW
+"""
+"""A container has no right to set its machine's clock."""
 
 
 def may_raise_limits() -> bool:

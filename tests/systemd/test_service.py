@@ -55,6 +55,15 @@ class Service:
         """The exit code of `wingcap verify`."""
         return self.machine.run(WINGCAP, "verify", *folders(flight)).returncode
 
+    def health(self) -> dict:
+        """What is shared with those who watch, as their user reads it."""
+        reader = ("runuser", "-u", "wingshape-monitor", "-g", "wingshape", "--", "cat", "/run/wingshape/health.json")
+        return json.loads(self.machine.ask(*reader))
+
+    def reasons(self) -> dict[str, str]:
+        """What stands against flying, by name."""
+        return {notice["name"]: notice["message"] for notice in self.health()["diagnostics"] if notice["level"] == 2}
+
 
 def folders(flight: str) -> list[str]:
     return [f"/mnt/ssd_{side}/{flight}" for side in ("left", "right")]
@@ -147,11 +156,67 @@ def test_a_full_disk_degrades_and_is_told(service):
     assert "free space on this disk" in "\n".join(service.messages())
     service.records(50)  # the right side goes on
     assert service.totals()["lost"] > 0
+    assert "disk left" in service.reasons()
     assert service.show("ActiveState", "NRestarts") == {"ActiveState": "active", "NRestarts": "0"}
     service.machine.ask("rm", "/mnt/ssd_left/ballast")
     service.machine.run("systemctl", "stop", "wingcap")
     flight = service.flights()[0]
     assert service.verify(flight) == 0
+
+
+def test_without_a_master_clock_it_records_and_shows_no_go(service):
+    service.records(50)  # no ptp4l at all
+    assert service.health()["go"] is False
+    assert "ptp.answers" in " ".join(service.reasons())
+    service.machine.ask("systemctl", "start", "wingshape-ptp4l")  # one that hears no master
+    try:
+        wait_for(lambda: "ptp.state" in " ".join(service.reasons()), 20.0, lambda: str(service.reasons()))
+        assert "ptp.answers" not in " ".join(service.reasons())
+        assert service.machine.show("wingshape-ptp4l", "User") == {"User": "wingshape-ptp"}
+        service.records(50)
+    finally:
+        service.machine.run("systemctl", "stop", "wingshape-ptp4l")
+    assert set(service.reasons()) <= {name for name in service.reasons() if "ptp" in name}
+    service.stop()
+    assert service.verify(service.flights()[0]) == 0
+
+
+def test_the_monitor_tells_no_go_to_who_has_the_token(service):
+    service.records(20)
+    service.machine.ask("systemctl", "start", "wingcap-monitor")
+    ask = (
+        "import json, sys, urllib.error, urllib.request as u\n"
+        "head = {'Authorization': 'Bearer ' + sys.argv[1]} if sys.argv[1:] else {}\n"
+        "try:\n"
+        "    print(u.urlopen(u.Request('http://127.0.0.1:8080/api/status', headers=head), timeout=5).read().decode())\n"
+        "except urllib.error.HTTPError as error:\n"
+        "    print(json.dumps(error.code))\n"
+    )
+    python = PREFIX / "bin/python"
+    token = service.machine.ask("cat", "/etc/wingshape/monitor.token")
+    wait_for(lambda: service.machine.run(python, "-c", ask).returncode == 0, 20.0)
+    assert json.loads(service.machine.ask(python, "-c", ask)) == 401
+    told = json.loads(service.machine.ask(python, "-c", ask, token))
+    assert told["go"] is False
+    assert any("ptp" in reason["name"] for reason in told["reasons"])
+    assert told["health"]["state"] == "recording"
+    assert service.machine.show("wingcap-monitor", "User", "NRestarts") == {
+        "User": "wingshape-monitor",
+        "NRestarts": "0",
+    }
+    service.machine.ask("systemctl", "stop", "wingcap-monitor")
+
+
+def test_a_word_stops_and_starts_it_and_idleness_is_no_fault(service):
+    service.records(20)
+    service.machine.ask(WINGCAP, "stop")
+    wait_for(lambda: service.health()["state"] == "idle", 15.0)
+    time.sleep(service.watchdog_s + 2.0)
+    assert service.show("ActiveState", "NRestarts") == {"ActiveState": "active", "NRestarts": "0"}
+    service.machine.ask(WINGCAP, "start")
+    wait_for(lambda: service.health()["state"] == "recording", 15.0)
+    service.stop()
+    assert [service.verify(flight) for flight in service.flights()] == [0, 0]
 
 
 def test_units_verify_and_are_confined(installed):
@@ -167,7 +232,8 @@ def test_units_verify_and_are_confined(installed):
 def test_install_is_idempotent_and_keeps_what_was_edited(installed):
     again = json.loads(installed.ask(WINGCAP, "install", "--json"))
     files = {action["target"]: action["what"] for action in again["actions"] if action["target"].startswith("/")}
-    assert files.pop(f"/{CONFIG}") == "kept"
-    assert set(files.values()) == {"unchanged"}
+    edited = {f"/{CONFIG}", "/etc/wingshape/ptp4l.conf", "/etc/wingshape/ptp.env"}
+    assert {path for path, what in files.items() if what == "kept"} == edited
+    assert {files[path] for path in files.keys() - edited} == {"unchanged"}
     assert installed.ask("systemctl", "is-enabled", "wingcap", "wingcap-monitor").split() == ["enabled", "enabled"]
     assert installed.ask("stat", "-c", "%a %U", "/etc/wingshape/monitor.token") == "600 root"
