@@ -74,28 +74,29 @@ class Adjustment:
 
 
 def rms_px(residuals_px: Array) -> float:
-    """Root mean square length of residuals (…, 2)."""
-    return float(np.sqrt(np.mean(np.sum(residuals_px**2, axis=-1))))
+    """Root mean square length of residuals (…, 2), those that are NaN left out."""
+    return float(np.sqrt(np.nanmean(np.sum(residuals_px**2, axis=-1))))
 
 
 def adjust(corners_px: Array, start: Estimate, freedom: Freedom) -> Adjustment:
-    """Adjust ``start`` to ``corners_px`` (C, V, N, 2).
+    """Adjust ``start`` to ``corners_px`` (C, V, N, 2), NaN where a corner was not seen.
 
     Raises ProcessError if the views do not determine what is asked for, or the optimum is not reached.
     """
-    space = _Space(start, freedom)
-    freedoms = corners_px.size - space.zero.size
+    seen = np.isfinite(corners_px)
+    space = _Space(start, freedom, np.asarray(seen.any(axis=(0, 1, 3))))
+    freedoms = int(seen.sum()) - space.zero.size
     if freedoms <= 0:
         raise ProcessError("too few corners for this many unknowns; take more views of the board")
     x, evaluations = _minimised(space, corners_px)
     estimate = space.estimate(x)
-    residuals = residuals_of(estimate, corners_px)
-    jacobian = space.jacobian(x)
+    whole = residuals_of(estimate, corners_px)
+    residuals, jacobian = whole[seen], space.jacobian(x, seen)
     if not np.all(np.isfinite(residuals)):
         raise ProcessError("the adjustment diverged; take more views of the board, tilted in different directions")
     columns = np.linalg.norm(jacobian, axis=0)
     length = np.linalg.norm(residuals)
-    cosine = np.abs(jacobian.T @ residuals.ravel()) / np.maximum(columns * length, 1e-300)
+    cosine = np.abs(jacobian.T @ residuals) / np.maximum(columns * length, 1e-300)
     gradient = float(cosine.max()) if length > 1e-9 else 0.0  # without residuals it is rounding alone
     scaled = jacobian / columns
     eigenvalues, vectors = np.linalg.eigh(scaled.T @ scaled)
@@ -110,7 +111,7 @@ def adjust(corners_px: Array, start: Estimate, freedom: Freedom) -> Adjustment:
     board = space.to_board @ half
     return Adjustment(
         estimate,
-        residuals,
+        whole,
         variance * covariance @ covariance.T,
         variance * board @ board.T,
         float(np.sqrt(variance)),
@@ -125,10 +126,10 @@ def _minimised(space: "_Space", corners_px: Array) -> tuple[Array, int]:
     By the normal equations of columns scaled to one: a fraction of the time of a QR factorisation, and as exact where
     it ends, since what ends it is the gradient itself.
     """
-    x, damping = space.zero.copy(), 1e-4
-    residuals = residuals_of(space.estimate(x), corners_px).ravel()
+    x, damping, seen = space.zero.copy(), 1e-4, np.isfinite(corners_px)
+    residuals = residuals_of(space.estimate(x), corners_px)[seen]
     for evaluation in range(1, MAX_EVALUATIONS):
-        jacobian = space.jacobian(x)
+        jacobian = space.jacobian(x, seen)
         if not np.all(np.isfinite(jacobian)):
             return x, evaluation
         columns = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
@@ -137,7 +138,7 @@ def _minimised(space: "_Space", corners_px: Array) -> tuple[Array, int]:
         while True:
             damped = normal + damping * np.eye(len(x))
             step = -np.asarray(solve(damped, gradient, assume_a="pos", check_finite=False)) / columns
-            trial = residuals_of(space.estimate(x + step), corners_px).ravel()
+            trial = residuals_of(space.estimate(x + step), corners_px)[seen]
             if trial @ trial <= residuals @ residuals:
                 break
             damping *= 10.0
@@ -154,7 +155,7 @@ def _minimised(space: "_Space", corners_px: Array) -> tuple[Array, int]:
 class _Space:
     """The numbers that move, x, and the estimate they stand for: start + a linear map of x."""
 
-    def __init__(self, start: Estimate, freedom: Freedom) -> None:
+    def __init__(self, start: Estimate, freedom: Freedom, seen: NDArray[np.bool_] | None = None) -> None:
         cameras = len(start.intrinsics)
         moving = [0, 1, 2, 3, *TERMS[freedom.distortion_terms]] if freedom.intrinsics else []
         chosen = [INTRINSICS * camera + index for camera in range(cameras) for index in moving]
@@ -163,7 +164,8 @@ class _Space:
         self._start = start
         self._shape = (cameras, len(start.views), len(start.board_m))
         self._parameters = np.eye(INTRINSICS * cameras + 6)[:, chosen]
-        self._board = _board_freedom(start.board_m) if freedom.board else np.zeros((start.board_m.size, 0))
+        seen = np.ones(len(start.board_m), bool) if seen is None else seen
+        self._board = _board_freedom(start.board_m, seen) if freedom.board else np.zeros((start.board_m.size, 0))
         self._sizes = np.cumsum([len(chosen), start.views.size, self._board.shape[1]])
         self.zero = np.zeros(self._sizes[-1])
         blank = np.zeros((len(self._parameters), len(self.zero) - len(chosen)))
@@ -183,8 +185,8 @@ class _Space:
             self._start.board_m + (self._board @ board).reshape(-1, 2),
         )
 
-    def jacobian(self, x: Array) -> Array:
-        """(residuals, len(x)) of the residuals, in px, by x."""
+    def jacobian(self, x: Array, seen: NDArray[np.bool_] | None = None) -> Array:
+        """(residuals, len(x)) of the residuals, in px, by x; of those (C, V, N, 2) that were ``seen``, or of all."""
         cameras, views, corners = self._shape
         estimate = self.estimate(x)
         by_all = np.zeros((cameras, views, corners, 2, len(x)))
@@ -196,15 +198,18 @@ class _Space:
                 by_all[camera, view, ..., first + 6 * view : first + 6 * view + 6] = by_view[view]
             per_corner = self._board.reshape(corners, 2, -1)
             by_all[camera, ..., second:] = np.einsum("vnij,njk->vnik", by_board, per_corner)
-        return by_all.reshape(-1, len(x))
+        return by_all.reshape(-1, len(x)) if seen is None or seen.all() else by_all[seen]
 
 
-def _board_freedom(board_m: Array) -> Array:
-    """(2N, 2N − 4) changes of the corners that keep their mean, their mean turn and their mean scale."""
-    x, y = (board_m - board_m.mean(axis=0)).T
+def _board_freedom(board_m: Array, seen: NDArray[np.bool_]) -> Array:
+    """(2N, 2S − 4) changes of the S corners ``seen`` that keep their mean, their mean turn and their mean scale."""
+    x, y = (board_m[seen] - board_m[seen].mean(axis=0)).T
     one, zero = np.ones_like(x), np.zeros_like(x)
     held = [np.stack(pair, axis=1).ravel() for pair in ((one, zero), (zero, one), (-y, x), (x, y))]
-    return np.asarray(null_space(np.array(held)))
+    free = null_space(np.array(held))
+    whole = np.zeros((board_m.size, free.shape[1]))
+    whole[np.repeat(seen, 2)] = free
+    return whole
 
 
 def residuals_of(estimate: Estimate, corners_px: Array) -> Array:

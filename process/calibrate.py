@@ -24,6 +24,9 @@ MIN_VIEWS = 3
 MIN_VIEWS_FOR_PRINT = 6  # below it, the printed corners are not told from the lens: the nominal board is used
 MIN_TILT_DEG = 5.0
 OUTLIER_RATIO = 3.0
+CORNER_RATIO = 10.0  # times its view's median: a normal error gets there once in 10^30
+LEAST_BLUNDER_PX = 0.2
+LEAST_CORNERS = 8  # of a view in each camera
 DISAGREEMENT_RATIO = 6.0  # each camera alone is less sure of a view's distance: they disagree more than they fit
 SAME_OPTIMUM = 1.0 + 1e-4
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-12)
@@ -69,26 +72,30 @@ class Calibration:
     board_sigma_m: Array
     """(N, 2), zero for the nominal board"""
     residuals_px: Array
-    """(2, views, N, 2) of the views used"""
+    """(2, views, N, 2) of the views used; NaN where a corner was not seen, or left out"""
     used: NDArray[np.intp]
     """indices of the views used"""
     rejected: dict[int, str]
     """index of each view left out: why"""
+    odd_corners: list[tuple[int, int, int, float]] = field(default_factory=list)
+    """camera, view, corner and residual in pixels of corners that were left out alone"""
     warnings: list[str] = field(default_factory=list)
 
 
 def calibrate(
     corners_px: Array, board: Board, size_px: tuple[int, int], settings: CalibrationSettings | None = None
 ) -> Calibration:
-    """Calibrate a pair from ``corners_px`` (2, V, N, 2) of both cameras, in the board's order.
+    """Calibrate a pair from ``corners_px`` (2, V, N, 2) of both cameras, in the board's order; NaN: not seen.
 
-    ``size_px`` is the images' width and height.
-    Views whose residuals stand out are left out and said. Raises ProcessError, with the remedy, if fewer than three
-    usable views remain, if they do not determine the cameras, or if the cameras are swapped.
+    ``size_px`` is the images' width and height. Views whose residuals stand out are left out and said, and so are
+    single corners. Raises ProcessError, with the remedy, if fewer than three usable views remain, if they do not
+    determine the cameras, or if the cameras are swapped.
     """
     settings = settings or CalibrationSettings()
+    corners_px = np.array(corners_px, np.float64)
     used = np.arange(corners_px.shape[1])
     rejected: dict[int, str] = {}
+    odd_corners: list[tuple[int, int, int, float]] = []
     while True:
         if len(used) < MIN_VIEWS:
             reasons = "; ".join(f"view {view + 1}: {reason}" for view, reason in rejected.items())
@@ -98,27 +105,34 @@ def calibrate(
         seen = np.ascontiguousarray(corners_px[:, used], np.float64)  # OpenCV takes no other layout
         check_poses_differ(seen[0], board, size_px)
         alone = _alone(seen, board, size_px, settings)
-        start = _join([adjustment for adjustment, _ in alone])
-        if start.stereo[3] > 0.0:
-            raise ProcessError(
-                "cam0 and cam1 are swapped: cam1 must be the right one as the pair looks at the board; "
-                "exchange --cam0 and --cam1"
-            )
-        # first where the views disagree on the pose between the cameras: a full adjustment of few views bends to fit
-        odd = _odd_view(residuals_of(start, seen)[1:], DISAGREEMENT_RATIO)
-        if odd is None:
-            stages = _solve(seen, alone, start, size_px, settings)
-            odd = _odd_view(stages.final.residuals_px, OUTLIER_RATIO)
+        blunders = _odd_corners(np.concatenate([adjustment.residuals_px for adjustment, _ in alone]))
+        if not blunders:
+            start = _join([adjustment for adjustment, _ in alone])
+            if start.stereo[3] > 0.0:
+                raise ProcessError(
+                    "cam0 and cam1 are swapped: cam1 must be the right one as the pair looks at the board; "
+                    "exchange --cam0 and --cam1"
+                )
+            # first where the views disagree on the pose between the cameras: an adjustment of few views bends to fit
+            odd = _odd_view(residuals_of(start, seen)[1:], DISAGREEMENT_RATIO)
             if odd is None:
-                return _result(stages, board, size_px, settings, used, rejected)
-        worst, reason = odd
-        rejected[int(used[worst])] = reason
-        used = np.delete(used, worst)
+                stages = _solve(seen, alone, start, size_px, settings)
+                blunders = _odd_corners(stages.final.residuals_px)
+                odd = None if blunders else _odd_view(stages.final.residuals_px, OUTLIER_RATIO)
+                if not blunders and odd is None:
+                    return _result(stages, board, size_px, settings, used, rejected, odd_corners)
+        for (camera, view, corner), off_px in blunders.items():
+            odd_corners.append((camera, int(used[view]), corner, off_px))
+            corners_px[camera, used[view], corner] = np.nan
+        if not blunders and odd is not None:
+            worst, reason = odd
+            rejected[int(used[worst])] = reason
+            used = np.delete(used, worst)
 
 
 def _odd_view(residuals_px: Array, ratio: float) -> tuple[int, str] | None:
     """The view with the largest residuals (C, V, N, 2), and what is odd about it; None if none stands out."""
-    view_rms = np.sqrt(np.mean(np.sum(residuals_px**2, axis=-1), axis=(0, 2)))
+    view_rms = np.sqrt(np.nanmean(np.sum(residuals_px**2, axis=-1), axis=(0, 2)))
     worst, median = int(np.argmax(view_rms)), float(np.median(view_rms))
     if view_rms[worst] <= max(ratio * median, 1e-6):
         return None
@@ -126,6 +140,18 @@ def _odd_view(residuals_px: Array, ratio: float) -> tuple[int, str] | None:
         f"residual {view_rms[worst]:.2f} px, the views' median is {median:.2f} px: the board moved between the two "
         "pictures, or they are not of the same instant"
     )
+
+
+def _odd_corners(residuals_px: Array) -> dict[tuple[int, int, int], float]:
+    """Camera, view and corner of residuals (C, V, N, 2) that are blunders, and their length: noise explains none.
+
+    Against the view's own corners: a view that is wrong as a whole has none.
+    """
+    off_px = np.linalg.norm(residuals_px, axis=-1)
+    usual_px = np.nanmedian(off_px, axis=2, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        odd = np.argwhere(off_px > np.maximum(CORNER_RATIO * usual_px, LEAST_BLUNDER_PX))
+    return {(int(c), int(v), int(n)): float(off_px[c, v, n]) for c, v, n in odd}
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +196,12 @@ def start_alone(
 ) -> tuple[Estimate, float]:
     """OpenCV's calibration (Zhang) of one camera from ``corners_px`` (V, N, 2), and its RMS in pixels."""
     plane = np.column_stack([board.points_m, np.zeros(board.corners)]).astype(np.float32)
-    views = [view.astype(np.float32).reshape(-1, 1, 2) for view in corners_px]
+    seen = [np.isfinite(view).all(axis=1) for view in corners_px]
+    views = [view[own].astype(np.float32).reshape(-1, 1, 2) for view, own in zip(corners_px, seen, strict=True)]
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3 if distortion_terms == 2 else 0
     try:
         rms, K, distortion, rotations, translations = cv2.calibrateCamera(
-            [plane] * len(views), views, size_px, None, None, flags=flags, criteria=CRITERIA
+            [plane[own] for own in seen], views, size_px, None, None, flags=flags, criteria=CRITERIA
         )
     except cv2.error as error:
         raise ProcessError("the views do not determine the camera: take views with the board tilted") from error
@@ -202,10 +229,16 @@ def _join(alone: list[Adjustment]) -> Estimate:
 def _library_stereo_rms_px(corners_px: Array, start: Estimate, size_px: tuple[int, int]) -> float:
     """Where cv2.stereoCalibrate ends with the intrinsics held: some versions stop early."""
     plane = np.column_stack([start.board_m, np.zeros(len(start.board_m))]).astype(np.float32)
-    views = [[view.astype(np.float32).reshape(-1, 1, 2) for view in camera] for camera in corners_px]
+    both = np.asarray(np.isfinite(corners_px).all(axis=(0, 3)))
+    enough = np.flatnonzero(both.sum(axis=1) >= LEAST_CORNERS)
+    if not len(enough):
+        return np.nan
+    views = [
+        [camera[view, both[view]].astype(np.float32).reshape(-1, 1, 2) for view in enough] for camera in corners_px
+    ]
     cameras = [CameraModel.from_intrinsics(*size_px, values) for values in start.intrinsics]
     rms, *_ = cv2.stereoCalibrate(
-        [plane] * len(views[0]),
+        [plane[both[view]] for view in enough],
         views[0],
         views[1],
         cameras[0].K.copy(),
@@ -226,6 +259,7 @@ def _result(
     settings: CalibrationSettings,
     used: NDArray[np.intp],
     rejected: dict[int, str],
+    odd_corners: list[tuple[int, int, int, float]],
 ) -> Calibration:
     final, estimate = stages.final, stages.final.estimate
     joint = settings.method is Method.joint
@@ -249,6 +283,7 @@ def _result(
         residuals_px=final.residuals_px,
         used=used,
         rejected=rejected,
+        odd_corners=odd_corners,
         warnings=_warnings(stages, settings, size_px, len(used)),
     )
 
@@ -256,8 +291,9 @@ def _result(
 def _with_print_scale(covariance: Array, final: Adjustment, board: Board) -> Array:
     """Add what the corners cannot show: the mean scale of a board whose corners are printed with random errors."""
     errors = final.estimate.board_m - board.points_m
-    print_variance = float(np.sum(errors**2)) / (2 * board.corners - 4)
-    scale_variance = print_variance / float(np.sum(board.points_m**2))
+    moved = np.any(errors != 0.0, axis=1)
+    print_variance = float(np.sum(errors**2)) / max(1, 2 * int(moved.sum()) - 4)
+    scale_variance = print_variance / float(np.sum(board.points_m[moved] ** 2)) if moved.any() else 0.0
     translation = np.concatenate([np.zeros(len(covariance) - 3), final.estimate.stereo[3:]])
     return covariance + scale_variance * np.outer(translation, translation)
 
@@ -295,7 +331,10 @@ def check_poses_differ(corners_px: Array, board: Board, size_px: tuple[int, int]
     focal = 1.2 * max(size_px)  # a guess is enough: equal views stay equal with any focal length
     K = np.array([[focal, 0, size_px[0] / 2], [0, focal, size_px[1] / 2], [0, 0, 1.0]])
     plane = np.column_stack([board.points_m, np.zeros(board.corners)])
-    turns = [cv2.solvePnP(plane, view, K, None)[1].ravel() for view in corners_px]
+    seen = [np.isfinite(view).all(axis=1) for view in corners_px]
+    turns = [
+        cv2.solvePnP(plane[own], view[own], K, None)[1].ravel() for view, own in zip(corners_px, seen, strict=True)
+    ]
     normals = np.array([rotation_matrix(turn)[:, 2] for turn in turns])
     spread_deg = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0)).max()))
     if spread_deg < MIN_TILT_DEG:

@@ -85,7 +85,7 @@ def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
     """What is printed, and written beside the parameters."""
     calibration = result.calibration
     pair = calibration.pair
-    view_rms_px = np.sqrt(np.mean(np.sum(calibration.residuals_px**2, axis=-1), axis=2))
+    view_rms_px = np.sqrt(np.nanmean(np.sum(calibration.residuals_px**2, axis=-1), axis=2))
     print_error = calibration.board_m - board.points_m
     return {
         "cameras": [

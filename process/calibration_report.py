@@ -80,13 +80,13 @@ def _residual_figure(result: SessionCalibration) -> Figure:
 
 def camera_rms(result: SessionCalibration, camera: int) -> float:
     """RMS in pixels of one camera's residuals as drawn."""
-    return float(np.sqrt(np.mean(np.sum(result.calibration.residuals_px[camera] ** 2, axis=-1))))
+    return float(np.sqrt(np.nanmean(np.sum(result.calibration.residuals_px[camera] ** 2, axis=-1))))
 
 
 def _views_figure(result: SessionCalibration) -> Figure:
     figure = Figure(figsize=(11, 3), layout="constrained")
     axes = figure.subplots()
-    rms_px = np.sqrt(np.mean(np.sum(result.calibration.residuals_px**2, axis=-1), axis=2))
+    rms_px = np.sqrt(np.nanmean(np.sum(result.calibration.residuals_px**2, axis=-1), axis=2))
     places = np.arange(len(result.used))
     for camera in (0, 1):
         axes.bar(places + 0.4 * camera - 0.2, rms_px[camera], 0.4, label=f"cam{camera}")

@@ -55,6 +55,26 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
         ),
         Step("2,000 simulated flights with faults", "pytest -q -s -m slow tests/capture/test_fault_simulation.py"),
     ),
+    "metrology": (
+        Step(
+            "coverage over 500 independently calibrated rigs",
+            "pytest -q -s tests/process/test_coverage.py",
+            (("WINGSHAPE_RIGS", "500"),),
+        ),
+        Step(
+            "accuracy over 20 calibrations a focal length: the paper's Tables 5 to 7",
+            "wingproc accuracy -o {target}/accuracy --calibrations 20",
+        ),
+        Step(
+            "centroid noise beside the Cramér-Rao bound, saturated lights, 300,000 identities",
+            "pytest -q -s -m slow tests/process/test_cramer_rao.py tests/process/test_detect.py tests/process/test_match.py",
+        ),
+        Step(
+            "detection: time a frame, errors, beside SimpleBlobDetector, trackpy and photutils",
+            "python tests/benchmarks/detection.py --frames 16 --rounds 9",
+        ),
+        Step("MATLAB's calibration of a public rig", "pytest -q -s tests/process/calibration/test_calibrate.py"),
+    ),
     "beam": (
         Step(
             "the beam's slow tests: coverage, 5,000 frames, the paper's way", "pytest -q -s -m slow tests/reconstruct"

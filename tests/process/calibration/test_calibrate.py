@@ -172,6 +172,39 @@ def test_a_view_of_another_instant_is_left_out_and_named():
     assert abs(result.pair.baseline_m - PAIR.baseline_m) < 1e-4
 
 
+def test_corners_that_were_not_seen_are_not_needed():
+    corners = see(printed(3), board_poses(12, 4), 0.03, 5)
+    rng = np.random.default_rng(6)
+    for camera in (0, 1):
+        for view in range(12):  # up to half of the board out of the picture, not the same half in both
+            hidden = BOARD.points_m[:, rng.integers(2)] * rng.choice([-1, 1]) > rng.uniform(0.01, 0.2)
+            corners[camera, view, hidden] = np.nan
+    result = calibrate(corners, BOARD, SIZE)
+    assert result.odd_corners == []
+    assert result.sigma_px == pytest.approx(0.03, rel=0.1)
+    error = result.pair.parameters - PAIR.parameters
+    assert error @ np.linalg.solve(result.pair.covariance, error) < 60  # χ² with 24
+    never = corners.copy()
+    never[:, :, 12] = np.nan
+    result = calibrate(never, BOARD, SIZE)
+    assert (result.board_m[12] == BOARD.points_m[12]).all()
+    assert (result.board_sigma_m[12] == 0.0).all()
+    assert (result.board_sigma_m[13] > 0.0).all()
+
+
+def test_a_blunder_costs_its_corner_and_is_named():
+    corners = see(printed(3), board_poses(12, 4), 0.03, 5)
+    corners[1, 4, 20] += [2.0, -1.0]
+    corners[0, 7, 3] += [0.0, 0.5]
+    result = calibrate(corners, BOARD, SIZE)
+    assert result.rejected == {}
+    assert {odd[:3] for odd in result.odd_corners} == {(1, 4, 20), (0, 7, 3)}
+    by_place = {odd[:3]: odd[3] for odd in result.odd_corners}
+    assert by_place[1, 4, 20] == pytest.approx(5**0.5, abs=0.3)
+    assert np.isnan(result.residuals_px[1, 4, 20]).all()
+    assert result.sigma_px == pytest.approx(0.03, rel=0.1)
+
+
 def test_swapped_cameras_are_refused():
     corners = see(BOARD.points_m, board_poses(8, 9), 0.05, 10)
     with pytest.raises(ProcessError, match="swapped"):
