@@ -7,7 +7,8 @@ Errors are of the lights that a method finds within 1.5 px of the truth.
 
     default, fast, paper   ours, process.detect
     SimpleBlobDetector     OpenCV, bright blobs, its own threshold steps
-    trackpy, photutils     where installed: locate(diameter 11); DAOStarFinder(fwhm 2.5) with a given threshold
+    trackpy, photutils     where installed: locate(diameter 9, separation 5), the most exact of those tried;
+                           DAOStarFinder(fwhm 2.5) with a given threshold. They take seconds: once, four frames
 """
 
 import argparse
@@ -29,6 +30,7 @@ from process.detect import DetectSettings, detect
 Array = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 LIGHTS = 18
+SLOW = ("trackpy", "photutils")
 
 
 def scenes(count: int) -> list[tuple[Frame, Array]]:
@@ -62,13 +64,14 @@ def methods() -> dict[str, Callable[[Frame], Array]]:
     trackpy, photutils = present("trackpy"), present("photutils.detection")
     if trackpy is not None:
         trackpy.quiet()
-        table["trackpy"] = lambda frame: trackpy.locate(frame, 11, minmass=300)[["x", "y"]].to_numpy()
+        table["trackpy"] = lambda frame: trackpy.locate(frame, 9, minmass=200, separation=5)[["x", "y"]].to_numpy()
     if photutils is not None:
         finder = photutils.DAOStarFinder(threshold=25.0, fwhm=2.5)
 
         def dao(frame: Frame) -> Array:
             found = finder(frame.astype(np.float64) - np.median(frame[::16, ::16]))
-            return np.stack([found["xcentroid"], found["ycentroid"]], axis=1)
+            names = ("x_centroid", "y_centroid") if "x_centroid" in found.colnames else ("xcentroid", "ycentroid")
+            return np.stack([found[name] for name in names], axis=1)
 
         table["photutils"] = dao
     return table
@@ -102,22 +105,26 @@ def main() -> None:
     cv2.setNumThreads(1)
     made, table = scenes(wanted.frames), methods()
     seconds: dict[str, list[float]] = {name: [] for name in table}
-    for _ in range(wanted.rounds):
+    for number in range(wanted.rounds):
         for name, method in table.items():
+            frames = made[:4] if name in SLOW else made
+            if name in SLOW and number > 0:
+                continue
             began = time.perf_counter()
-            for frame, _ in made:
+            for frame, _ in frames:
                 method(frame)
-            seconds[name].append((time.perf_counter() - began) / len(made))
+            seconds[name].append((time.perf_counter() - began) / len(frames))
     rows = {}
     for name, method in table.items():
-        errors = [errors_px(method(frame), truth) for frame, truth in made]
+        frames = made[:4] if name in SLOW else made
+        errors = [errors_px(method(frame), truth) for frame, truth in frames]
         best = min(seconds[name])
         rows[name] = {
             "ms": 1000.0 * best,
             "median_ms": 1000.0 * float(np.median(seconds[name])),
             "frames_per_s": 1.0 / best,
             "times_faster_than_simple_blob": min(seconds["SimpleBlobDetector"]) / best,
-            "found_of": [sum(map(len, errors)), LIGHTS * len(made)],
+            "found_of": [sum(map(len, errors)), LIGHTS * len(frames)],
             "rms_px": float(np.sqrt(np.mean(np.concatenate(errors) ** 2))),
         }
     if wanted.json:
