@@ -8,7 +8,7 @@ idea of it, and are weighted by how well they have predicted (Magill, 1965, mult
 A receive time is late by what the link took: never less than a floor, often much more. The least of a block of
 frames is near the floor. While triggers are reported the floor is learned; while they are not, it carries the fit on.
 
-Plain numbers, no arrays: a frame costs about 12 µs in the read thread, and memory is bounded.
+Plain numbers, no arrays: a frame costs about 10 µs in the read thread, and memory is bounded.
 """
 
 import math

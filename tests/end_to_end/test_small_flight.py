@@ -1,5 +1,6 @@
 """The whole chain on a small flight, by the commands a user types, and what those commands say when given bad input."""
 
+import csv
 import json
 import os
 import shutil
@@ -14,6 +15,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from capture.record import Frame
+from capture.scan import scan
 from hw_sim.demo import executable
 
 SCALE, SECONDS, RATE_HZ = 4, 3, 25
@@ -68,6 +71,20 @@ def test_the_errors_are_those_of_the_tables(demo):
             squares.append(np.sum(np.square(errors), axis=0))
     rms_mm = 1e3 * np.sqrt(np.mean(np.concatenate(squares)))
     assert rms_mm == pytest.approx(json.loads((demo / "summary.json").read_text())["marker_rms_mm"], rel=0.03)
+
+
+def test_every_frames_instant_is_that_of_its_edge(demo):
+    """The simulated cameras' clocks start anywhere and drift; the edges' true times are in the truth."""
+    with (demo / "truth/triggers.csv").open(encoding="utf-8") as file:
+        edges = {int(row["index"]): int(row["actual_ns"]) for row in csv.DictReader(file)}
+    frames = []
+    for folder in FLIGHT:
+        for path in sorted((demo / folder).glob("*.mcap")):
+            frames += [Frame.decode(m.data) for m in scan(path)[1] if m.topic.endswith("/frame")]
+    errors = np.array([abs(frame.exposure_start_ns - edges[frame.trigger_index]) for frame in frames])
+    assert len(frames) > 3.5 * TRIGGERS
+    assert np.quantile(errors, 0.95) < 50_000
+    assert all(error < 5 * frame.time_sigma_ns for error, frame in zip(errors, frames, strict=True))
 
 
 def test_load_factor_and_controls_stand_beside_the_tip(demo):
