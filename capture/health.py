@@ -89,7 +89,7 @@ class Health:
 
     flight: str
     state: str
-    """``starting``, ``armed``, ``recording``, ``stopping``, ``ended``, and what else the daemon has"""
+    """``idle``, ``starting``, ``armed``, ``test burst``, ``recording``, ``stopping``, ``ended``"""
     recording_s: float
     triggers: int
     trigger_rate_hz: float

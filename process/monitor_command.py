@@ -34,6 +34,9 @@ def monitor(
         Path | None,
         typer.Option(help="File with the token that is asked for; $CREDENTIALS_DIRECTORY/token if there is one."),
     ] = None,
+    control: Annotated[
+        bool, typer.Option("--control", help="Allow to start and stop recordings from the page.")
+    ] = False,
     certificate: Annotated[Path | None, typer.Option(help="PEM certificate: the page is then https.")] = None,
     key: Annotated[Path | None, typer.Option(help="PEM key of the certificate.")] = None,
     foxglove: Annotated[
@@ -47,13 +50,12 @@ def monitor(
     """
     try:
         from process.monitor.app import Status, make_app
+        from process.monitor.control import Control
         from process.monitor.gallery import Gallery
         from process.monitor.guard import Guard
         from process.monitor.server import make_server
     except ImportError as error:
         raise ProcessError(f"{error.name} is not installed: pip install 'wingshape[monitor]'") from error
-    from process.monitor.control import NoControl
-
     token = _token(token_file)
     if token is None and not _is_loopback(host):
         raise UsageError(f"--host {host} is beyond this computer: give a --token-file, or leave the host at 127.0.0.1")
@@ -64,7 +66,7 @@ def monitor(
         os.nice(_NICE)
     cv2.setNumThreads(1)
     gallery = Gallery(folder or default_folder())
-    status = Status(folder or default_folder(), gallery, NoControl("this recorder takes no commands from the page"))
+    status = Status(folder or default_folder(), gallery, Control(control))
     guard = Guard(make_app(status), token, own_hosts(host))
     server = make_server(guard, certificate, key)
     gallery.start()

@@ -5,9 +5,10 @@ import time
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
@@ -15,6 +16,7 @@ from starlette.routing import Route
 
 from capture.errors import CaptureError
 from capture.health import Health, Notice, Verdict, judge, read_health
+from process.monitor.control import Control
 from process.monitor.gallery import Gallery
 from process.monitor.guard import BodyTooLarge
 from process.monitor.metrics import CONTENT_TYPE, metrics_text, ptp_offset_ns
@@ -27,16 +29,6 @@ _PAGE = {
     "monitor.js": ("monitor.js", "text/javascript; charset=utf-8"),
 }
 ACTIONS = ("start", "stop")
-
-
-class Control(Protocol):
-    """Starts and stops the recorder."""
-
-    def refusal(self, health: Health | None) -> str | None:
-        """Why it does not now; None: it does."""
-
-    def act(self, health: Health, action: str) -> str:
-        """``start`` or ``stop``; what the recorder answered. Raises ``CaptureError`` when it refused."""
 
 
 class Status:
@@ -146,7 +138,7 @@ async def _act(status: Status, request: Request) -> Response:
     if refusal is not None or health is None:
         return _answer(409, refusal or "no recorder")
     try:
-        return _answer(200, status.control.act(health, action))
+        return _answer(200, await run_in_threadpool(status.control.act, health, action))
     except CaptureError as error:
         return _answer(502, str(error))
 

@@ -116,9 +116,9 @@ function parts(status) {
 
 function controls(status) {
   const refusal = status.control.refusal;
-  const recording = status.health !== null && status.health.state === "recording";
-  byId("start").disabled = refusal !== null || recording;
-  byId("stop").disabled = refusal !== null || !recording;
+  const state = status.health === null ? "" : status.health.state;
+  byId("start").disabled = refusal !== null || state !== "idle";
+  byId("stop").disabled = refusal !== null || !["armed", "test burst", "recording"].includes(state);
   show(byId("control-note"), refusal ?? byId("controls").dataset.answer ?? "");
 }
 

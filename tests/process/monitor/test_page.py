@@ -139,6 +139,34 @@ def test_no_go_when_the_master_clock_is_lost(field, page, tmp_path):
         no_go(page, since_s, "ptp")
 
 
+def test_start_and_stop_ask_first(field, page):
+    field.extra = '[start]\non = "command"'
+    field.start_rig()
+    field.start_recorder()
+    field.start_monitor("--control")
+    page.goto(field.address)
+    page.locator("header.nogo #reasons li", has_text="idle").wait_for(timeout=30_000)
+    assert page.locator("#stop").is_disabled()
+    page.locator("#start").click()
+    page.locator("#question", has_text="Start recording?").wait_for()
+    page.locator("#yes").click()
+    page.locator("header.go").wait_for(timeout=30_000)
+    page.locator("#stop").click()
+    page.locator("#question", has_text="Stop recording test_07?").wait_for()
+    page.keyboard.press("Enter")  # No is what a slip of the finger gets
+    page.locator("#confirm").wait_for(state="hidden")
+    time.sleep(1.5)
+    assert field.status()["health"]["state"] == "recording"
+    page.locator("#stop").click()
+    page.locator("#yes").click()
+    page.locator("header.nogo #reasons li", has_text="idle").wait_for(timeout=30_000)
+    assert "stopping" in page.locator("#control-note").inner_text()
+    result = field.recorded()
+    assert result["failures"] == []
+    assert result["frames_recorded"] + result["frames_lost"] == 4 * result["triggers"]
+    assert page.complaints == []
+
+
 def test_a_browser_is_asked_for_the_token_and_then_shows_the_page(field, tmp_path):
     needs_module("playwright")
     from playwright.sync_api import Error, sync_playwright
