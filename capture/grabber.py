@@ -274,7 +274,7 @@ class Grabber(Worker):
         """A camera's counter and clock, of which nothing is known yet."""
         parts = self._parts
         clock = FrameClock(description, parts.triggers, parts.clock_state, parts.trigger_latency_ns)
-        return FrameNumbering(description, parts.triggers), clock
+        return FrameNumbering(description, parts.triggers, parts.ledger.decided_below(self.place)), clock
 
     @property
     def _gate_name(self) -> str:

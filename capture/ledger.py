@@ -131,9 +131,13 @@ class Ledger:
         with self._mutex:
             return max(self._next_index, *(account.next_index for account in self._accounts.values()))
 
+    def decided_below(self, place: Place) -> int:
+        """Every trigger below this index has been decided upon for this camera."""
+        return self._accounts[place].next_index
+
     def complete(self, place: Place, next_index: int) -> bool:
         """Whether every trigger below ``next_index`` has been decided upon for this camera."""
-        return self._accounts[place].next_index >= next_index
+        return self.decided_below(place) >= next_index
 
     def accounts(self) -> dict[Place, CameraAccount]:
         """The books as they stand."""

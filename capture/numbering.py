@@ -48,7 +48,9 @@ class FrameNumbering:
     after ``CONFIRMING`` of them in a row it is begun with anew.
     """
 
-    def __init__(self, camera: CameraDescription, triggers: Triggers) -> None:
+    def __init__(self, camera: CameraDescription, triggers: Triggers, earliest_index: int = 0) -> None:
+        """``earliest_index`` is the first trigger that a frame can be of."""
+        self._earliest = earliest_index
         self._camera = camera
         self._triggers = triggers
         self._held: list[Grab] = []
@@ -64,6 +66,7 @@ class FrameNumbering:
             numbered = self._next(grab, self._last)
             self._strays = 0 if numbered else self._strays + 1
             if self._strays >= CONFIRMING:  # its clock has begun anew
+                self._earliest = self._last[1].index + 1
                 self._last, self._strays = None, 0
             return [(grab, numbered)]
         self._held.append(grab)
@@ -87,7 +90,7 @@ class FrameNumbering:
             latest_ns = grab.receive_ns - grab.exposure_us * 1000 - readout_ns
             trigger = self._triggers.latest_before(latest_ns, FIRST_REPORT_WAIT_S)
             first = trigger and self._triggers.nearest(trigger[1] - later_ns, FIRST_REPORT_WAIT_S)
-            if first:
+            if first and first[0] >= self._earliest:  # what was reckoned beyond it is wrong
                 found.append(first)
         return Numbered(*min(found), 0) if found else None
 

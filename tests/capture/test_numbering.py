@@ -79,6 +79,24 @@ def test_a_clock_that_jumps_costs_a_few_frames_and_no_wrong_one():
     assert numbers == [(k, None if 10 <= k < 10 + CONFIRMING else k) for k in range(40)]
 
 
+def test_no_frame_is_of_a_trigger_before_the_first():
+    """The board pauses and its last report is late: reckoned by the period, the first frame would be of trigger 6."""
+    edges = [START_NS + k * PERIOD_NS for k in (0, 1, 2)] + [START_NS + round(4.6 * PERIOD_NS)]
+    log = TriggerLog(25)
+    for index, edge_ns in enumerate(edges[:3]):
+        log.add(Pulse(7 + index, index, edge_ns, edge_ns))
+    frames = [
+        Grab(0, k, edge_ns, edge_ns + EXPOSURE_US * 1000 + ROW_NS * HEIGHT, EXPOSURE_US, 0.0, FrameStatus.COMPLETE)
+        for k, edge_ns in enumerate(edges)
+    ]
+    told = {}
+    for earliest in (0, 7):
+        numbering = FrameNumbering(CAMERA, log, earliest)
+        told[earliest] = [numbered and numbered.index for k in frames for _, numbered in numbering.feed(k)]
+    assert told[7][:3] == [7, 8, 9]
+    assert told[0][0] == 6  # what the bound is for
+
+
 def test_the_log_believes_no_pulse_that_goes_back():
     log = TriggerLog(25)
     for index, time_ns in ((5, 1_000_000_000), (5, 1_000_000_001), (4, 2_000_000_000), (6, 999_999_999)):
