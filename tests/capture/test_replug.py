@@ -69,7 +69,7 @@ def test_a_pulled_camera_leaves_the_others_without_a_gap_and_comes_back(folder):
     cameras = result["cameras"]
     lost = cameras.pop("right/cam0")["lost"]
     assert lost["camera"] > 25
-    # On a busy machine the rig itself may be held up and drop a few; test_recording and the simulated flights are exact.
+    # On a busy machine the rig is held up and may drop a few; test_recording and the simulated flights are exact.
     assert all(camera["recorded"] >= 190 for camera in cameras.values()), cameras
     report = inspect([folder])
     assert report.problems == []
