@@ -67,7 +67,8 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
         ),
         Step(
             "centroid noise beside the Cramér-Rao bound, saturated lights, 300,000 identities",
-            "pytest -q -s -m slow tests/process/test_cramer_rao.py tests/process/test_detect.py tests/process/test_match.py",
+            "pytest -q -s -m slow tests/process/test_cramer_rao.py tests/process/test_detect.py "
+            "tests/process/test_match.py",
         ),
         Step(
             "detection: time a frame, errors, beside SimpleBlobDetector, trackpy and photutils",
