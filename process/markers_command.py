@@ -100,7 +100,7 @@ def markers(
     moved = drift(result.table, recording, cameras)
     write_table(moved, drift_path(output), command=command, inputs=[rig])
     summary = summarise(result) | {"drift": worst(moved), "signals": [signal.name for signal in signals.signals]}
-    problems = (*result.problems, *signals.problems)
+    problems = tuple(dict.fromkeys((*result.problems, *signals.problems)))  # both have read the aux files
     if json:
         say_json(
             {**summary, "problems": list(problems), "output": str(output), "output_signals": str(signals_path(output))}

@@ -8,7 +8,7 @@ Format: https://mcap.dev/spec (records and opcodes), version 0.
 import hashlib
 import os
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,8 +74,11 @@ class BadChunk(ValueError):
     """A chunk whose bytes are not what was written."""
 
 
-def index_file(path: Path) -> FileIndex:
-    """Every message of ``path``. A file that ends early is read up to its last complete chunk; nothing is raised."""
+def index_file(path: Path, topics: Container[str] | None = None) -> FileIndex:
+    """The messages of ``path`` on ``topics``; None: on all.
+
+    A file that ends early is read up to its last complete chunk; nothing is raised.
+    """
     index = FileIndex()
     channels: dict[int, str] = {}
     content = hashlib.sha256()
@@ -88,13 +91,44 @@ def index_file(path: Path) -> FileIndex:
                 try:
                     head = _chunk_head(os.pread(descriptor, 256, at), size)
                     content.update(struct.pack("<QQI", at, size, head.crc))
-                    index.messages.extend(_messages_of_chunk(str(path), descriptor, at, size, head, channels))
+                    found = _messages_of_chunk(str(path), descriptor, at, size, head, channels)
+                    index.messages.extend(one for one in found if topics is None or one.topic in topics)
                 except (BadChunk, McapError) as error:
                     index.problems.append(f"{path}: chunk at byte {at} is not readable ({error})")
     except OSError as error:
         index.problems.append(f"{path}: {error.strerror or error}")
     index.fingerprint = content.hexdigest()
     return index
+
+
+def stream_messages(
+    path: Path, topics: Container[str], problems: list[str]
+) -> Iterator[tuple[MessageHead, memoryview]]:
+    """Each message of ``path`` on ``topics`` with its data, a chunk in memory at a time.
+
+    What cannot be read is said in ``problems`` and left out; nothing is raised.
+    """
+    channels: dict[int, str] = {}
+    try:
+        with _Descriptor(path) as descriptor:
+            chunks = _chunks_of_summary(path, channels)
+            if chunks is None:
+                chunks = _chunks_by_scanning(path, descriptor, channels, problems)
+            for at, size in chunks:
+                try:
+                    head = _chunk_head(os.pread(descriptor, 256, at), size)
+                    heads = list(_messages_of_chunk(str(path), descriptor, at, size, head, channels))
+                    chunk = memoryview(bytearray(size))
+                    _read_fully(descriptor, chunk, at)
+                    records = _records_of_chunk(chunk)
+                except (BadChunk, McapError) as error:
+                    problems.append(f"{path}: chunk at byte {at} is not readable ({error})")
+                    continue
+                for one in heads:
+                    if one.topic in topics:
+                        yield one, records[one.place.at : one.place.at + one.place.size]
+    except OSError as error:
+        problems.append(f"{path}: {error.strerror or error}")
 
 
 class ChunkReader:

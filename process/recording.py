@@ -134,7 +134,7 @@ def open_recording(paths: Sequence[Path | str]) -> Recording:
     owner = {image_topic(s, CAMERAS[c]): places[s, c].images for s, c in places}
     owner |= {frame_topic(s, CAMERAS[c]): places[s, c].frames for s, c in places}
     for path in files:
-        index = index_file(path)
+        index = index_file(path, {*owner, LOSS_TOPIC})
         problems.extend(index.problems)
         fingerprints[str(path)] = index.fingerprint
         losses |= _losses([head for head in index.messages if head.topic == LOSS_TOPIC])

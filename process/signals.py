@@ -1,7 +1,7 @@
 """A flight's CAN, analog and MAVLink messages to named signals in time, and its gates to spans in which they failed."""
 
-import contextlib
 import math
+from array import array
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from capture.errors import ProcessError
 from capture.record import ANALOG_TOPIC, CAN_TOPIC, GATE_TOPIC, MAVLINK_TOPIC, Analog, CanFrame, Gate, Mavlink
-from process.mcap_file import BadChunk, ChunkReader, MessageHead, index_file
+from process.mcap_file import stream_messages
 from process.recording import find_files
 
+_TOPICS = frozenset((CAN_TOPIC, ANALOG_TOPIC, MAVLINK_TOPIC, GATE_TOPIC))
 _CLOCKS = frozenset(("time_boot_ms", "time_usec"))  # of the autopilot: when, not what
 _PERIODS = {
     ("ATTITUDE", "roll"): 2 * math.pi,
@@ -77,7 +78,12 @@ class _Series:
     unit: str = ""
     held: bool = False
     period: float = math.nan
-    samples: list[tuple[int, float]] = field(default_factory=list)
+    time_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    value: "array[float]" = field(default_factory=lambda: array("d"))
+
+    def add(self, time_ns: int, value: float) -> None:
+        self.time_ns.append(time_ns)
+        self.value.append(value)
 
 
 _All = dict[tuple[str, ...], _Series]
@@ -100,56 +106,36 @@ def read_signals(flight_paths: Sequence[Path | str], dbc: Sequence[Path] = ()) -
     meaning: _Meaning = {}
     for path in reversed(dbc):
         meaning |= _read_dbc(path)
-    copies, problems = _copies(flight_paths)
+    files = find_files(flight_paths)
+    files = tuple(path for path in files if path.name.startswith("aux_")) or files
+    problems: list[str] = []
     found: _All = {}
     outages: dict[tuple[str, int], Outage] = {}
     unknown: Counter[int] = Counter()
-    reader = ChunkReader()
-    for topic, heads in copies:
+    seen: set[tuple[str, int, int]] = set()  # the other disk has a copy
+    for head, data in (one for path in files for one in stream_messages(path, _TOPICS, problems)):
+        identity = (head.topic, head.sequence, head.publish_time_ns)
+        if identity in seen:
+            continue
+        seen.add(identity)
         try:
-            data = _first_whole(reader, heads)
-            if topic == CAN_TOPIC:
+            if head.topic == CAN_TOPIC:
                 _take_can(found, CanFrame.decode(data), meaning, unknown)
-            elif topic == ANALOG_TOPIC:
+            elif head.topic == ANALOG_TOPIC:
                 _take_analog(found, Analog.decode(data))
-            elif topic == MAVLINK_TOPIC:
+            elif head.topic == MAVLINK_TOPIC:
                 _take_mavlink(found, Mavlink.decode(data))
             else:
                 gate = Gate.decode(data)
                 end_ns = gate.end_ns or None
                 outages[gate.name, gate.begin_ns] = Outage(gate.name, gate.cause, gate.begin_ns, end_ns)
-        except (ValueError, OSError) as error:
-            problems.append(f"{heads[0].place.path}: a message on {topic} is not readable ({error})")
-    reader.close()
+        except ValueError as error:
+            problems.append(f"{head.place.path}: a message on {head.topic} is not readable ({error})")
     if unknown:
         said = f"{unknown.total()} CAN frames of {len(unknown)} identifiers"
         problems.append(f"{said} are in no DBC file" if dbc else f"{said} are recorded: --dbc FILE names their signals")
     by_begin = sorted(outages.values(), key=lambda outage: outage.begin_ns)
     return Signals(_named(found), tuple(by_begin), tuple(problems))
-
-
-def _copies(flight_paths: Sequence[Path | str]) -> tuple[list[tuple[str, list[MessageHead]]], list[str]]:
-    """Topic and copies of each message in question, in order, and what is wrong with the files."""
-    files = find_files(flight_paths)
-    files = tuple(path for path in files if path.name.startswith("aux_")) or files
-    topics = (CAN_TOPIC, ANALOG_TOPIC, MAVLINK_TOPIC, GATE_TOPIC)
-    copies: dict[tuple[str, int, int], list[MessageHead]] = {}
-    problems: list[str] = []
-    for path in files:
-        index = index_file(path)
-        problems.extend(index.problems)
-        for head in index.messages:
-            if head.topic in topics:
-                copies.setdefault((head.topic, head.sequence, head.publish_time_ns), []).append(head)
-    return [(topic, heads) for (topic, _, _), heads in copies.items()], problems
-
-
-def _first_whole(reader: ChunkReader, heads: list[MessageHead]) -> memoryview:
-    """The message's bytes, from the first copy that can be read."""
-    for head in heads[:-1]:
-        with contextlib.suppress(BadChunk, OSError):
-            return reader.read(head.place)
-    return reader.read(heads[-1].place)
 
 
 def _read_dbc(path: Path) -> _Meaning:
@@ -179,12 +165,12 @@ def _take_can(found: _All, frame: CanFrame, meaning: _Meaning, unknown: Counter[
             signal = message.get_signal_by_name(name)
             held = bool(signal.choices) or signal.length == 1
             found[key] = _Series(key, 1, CAN_TOPIC, signal.unit or "", held)
-        found[key].samples.append((frame.stamp_ns, float(value)))
+        found[key].add(frame.stamp_ns, float(value))
 
 
 def _take_analog(found: _All, sample: Analog) -> None:
     key = ("analog", sample.name)
-    found.setdefault(key, _Series(key, 1, ANALOG_TOPIC)).samples.append((sample.time_ns, sample.value))
+    found.setdefault(key, _Series(key, 1, ANALOG_TOPIC)).add(sample.time_ns, sample.value)
 
 
 def _take_mavlink(found: _All, message: Mavlink) -> None:
@@ -194,15 +180,14 @@ def _take_mavlink(found: _All, message: Mavlink) -> None:
             continue
         key = (system, message.message.lower(), name)
         period = _PERIODS.get((message.message, name), math.nan)
-        found.setdefault(key, _Series(key, 2, MAVLINK_TOPIC, period=period)).samples.append((message.time_ns, value))
+        found.setdefault(key, _Series(key, 2, MAVLINK_TOPIC, period=period)).add(message.time_ns, value)
 
 
 def _named(found: _All) -> tuple[Signal, ...]:
     names = _short_names([(series.key, series.least) for series in found.values()])
     signals = []
     for series in found.values():
-        time_ns = np.array([at for at, _ in series.samples], dtype=np.int64)
-        value = np.array([one for _, one in series.samples])
+        time_ns, value = np.array(series.time_ns, dtype=np.int64), np.array(series.value, dtype=np.float64)
         order = np.argsort(time_ns, kind="stable")
         time_ns, value = time_ns[order], value[order]
         last = np.append(np.diff(time_ns) > 0, True)  # of two at the same instant the later one

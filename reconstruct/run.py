@@ -212,7 +212,7 @@ class _Source:
             self._recording = open_recording(self._job.flights)
             check_cameras(self._recording.files, self.rig)
             self.beside = beside_flight(self._job.flights, self._job.dbc, self._job.max_gap_s)
-            self.problems = (*self._recording.problems, *self.beside.signals.problems)
+            self.problems = tuple(dict.fromkeys((*self._recording.problems, *self.beside.signals.problems)))
             self.flight_s = self._recording.duration_s
 
     def note(self, plan: FitPlan) -> dict[str, Any]:
