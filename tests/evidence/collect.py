@@ -76,6 +76,13 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
         ),
         Step("MATLAB's calibration of a public rig", "pytest -q -s tests/process/calibration/test_calibrate.py"),
     ),
+    "power": (
+        Step(
+            "20 power cuts of a recording guest",
+            "pytest -q -s tests/vm/test_power_cut.py",
+            (("WINGSHAPE_CUTS", "20"),),
+        ),
+    ),
     "beam": (
         Step(
             "the beam's slow tests: coverage, 5,000 frames, the paper's way", "pytest -q -s -m slow tests/reconstruct"

@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 
 from camera_harness import Harness
-from needs import needs_module
 
 from capture.camera.base import CameraSettings
+from capture.camera.v4l2_device import V4l2Device
 
 DEVICE = "/dev/video0"
 MODULE = ("vivid", "n_devs=1", "node_types=0x1", "num_inputs=1", "input_types=0x0")
@@ -34,14 +34,16 @@ class VividHarness(Harness):
     back_within_s = 30.0
 
     def __enter__(self) -> "VividHarness":
-        needs_module("linuxpy")
         subprocess.run(["modprobe", *MODULE], check=True)
+        self._held: V4l2Device | None = None
         self.address = f"{DEVICE}?exposure=fixed&fps=10"
         self.settings = CameraSettings(320, 180, 2000, 0.0)
         self._wait_for_device()
         return self
 
     def __exit__(self, *exception: object) -> None:
+        if self._held is not None:
+            self._held.close()
         subprocess.run(["rmmod", "vivid"], check=False)
 
     def drop(self) -> None:
@@ -50,16 +52,19 @@ class VividHarness(Harness):
         self._set("percentage_of_dropped_buffers", 0)
 
     def unplug(self) -> None:
+        """It would come back when its last user lets go, so we hold on to it."""
+        self._held = V4l2Device(DEVICE)
+        control = self._held.controls()["disconnect"]
         with contextlib.suppress(OSError):  # it is gone before it can say that it went
-            self._set("disconnect", 1)
+            self._held.set(control, 1)
 
     def plug(self) -> None:
-        """It comes back by itself, when its last user lets go."""
+        assert self._held is not None
+        self._held.close()
+        self._held = None
         self._wait_for_device()
 
     def _set(self, name: str, value: int) -> None:
-        from capture.camera.v4l2_device import V4l2Device
-
         with contextlib.closing(V4l2Device(DEVICE)) as device:
             device.set(device.controls()[name], value)
 

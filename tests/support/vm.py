@@ -3,12 +3,15 @@
 The guest's root is ours, read-only over 9p with a tmpfs on top: what the script starts is this checkout in this
 environment, and nothing it writes stays, except in the artifacts folder, which is shared. The kernel comes from
 Debian's archive once, into ``~/.cache/wingshape``; it has what a container's host may lack: USB, V4L2, CAN, disks.
-Emulated (no KVM), so ten to twenty times slower than here: assert counts and ids in it, never speed.
+
+Emulated (no KVM), and its clock counts instructions: it is a machine of constant speed for whoever is in it, however
+busy this one is. Assert counts and ids in it, and times by its own clock, never speed.
 """
 
 import gzip
 import lzma
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -110,8 +113,21 @@ class Vm:
         initramfs.write_bytes(_initramfs(kernel))
         self._console = artifacts / "console"
         command = [
-            *(needs_program("qemu-system-x86_64"), "-M", "q35", "-accel", "tcg,thread=multi", "-cpu", "max"),
-            *("-smp", "2", "-m", str(memory_mb), "-nodefaults", "-no-reboot", "-display", "none", "-net", "none"),
+            *(needs_program("qemu-system-x86_64"), "-M", "q35", "-accel", "tcg", "-cpu", "max"),
+            *(
+                "-icount",
+                "shift=0",
+                "-rtc",
+                "clock=vm",
+                "-m",
+                str(memory_mb),
+                "-nodefaults",
+                "-no-reboot",
+                "-display",
+                "none",
+                "-net",
+                "none",
+            ),
             *("-kernel", str(kernel.image), "-initrd", str(initramfs), "-serial", f"file:{self._console}"),
             *("-append", "console=ttyS0 quiet panic=-1 mitigations=off tsc=reliable no_timer_check"),
             *_share("root", Path("/"), ",readonly=on"),
@@ -126,16 +142,16 @@ class Vm:
         path = self.artifacts / "output"
         return path.read_text(errors="replace") if path.exists() else ""
 
-    def wait_for(self, words: str, timeout_s: float) -> None:
-        """Wait until the script has said ``words``.
+    def wait_for(self, pattern: str, timeout_s: float) -> None:
+        """Wait until the script has said what the regular expression ``pattern`` matches.
 
         Raises:
             TimeoutError: it did not, or ended before; the message has what it said.
         """
         deadline_s = time.monotonic() + timeout_s
-        while words not in self.output:
+        while not re.search(pattern, self.output):
             if time.monotonic() > deadline_s or self._process.poll() is not None:
-                raise TimeoutError(f"the guest never said {words!r}:\n{self.output}\n{self._said()}")
+                raise TimeoutError(f"the guest never said {pattern!r}:\n{self.output}\n{self._said()}")
             time.sleep(0.05)
 
     def kill(self) -> None:

@@ -1,0 +1,179 @@
+"""A real power cut: QEMU killed while its guest records, on disks that forget what was not flushed.
+
+``WINGSHAPE_CUTS`` of them (5 in CI), at moments that ``WINGSHAPE_SEED`` decides. In every other one an arbitrary part
+of what was not flushed survives, as on real disks. What must come back is known from outside: the guest's clock at the
+cut says how much may be missing, and each frame is drawn again from its trigger's time.
+"""
+
+import itertools
+import os
+import random
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from forgetful_disk import ForgetfulDisk
+from mcap.reader import make_reader
+from needs import needs_program
+from vm import WINGCAP, WINGSIM, Vm
+
+from capture.record import Frame, decode_image
+from capture.recover import CAUSE, recover_flight
+from capture.verify import CameraReport, inspect
+from hw_sim.render import LiveRenderer, noise_frames
+from hw_sim.world import World
+
+pytestmark = pytest.mark.slow
+CUTS = int(os.environ.get("WINGSHAPE_CUTS", "5"))
+SEED = int(os.environ.get("WINGSHAPE_SEED", "11"))
+MOST_LOST_S = 1.0
+RATE_HZ = 8
+SCALE = 16  # of the image: 130×97
+DISK_MB = 96
+SIDES = ("left", "right")
+BOOT_S = 120.0
+
+CONFIG = f"""
+flight = "cut"
+[trigger]
+port = "trigger"
+rate_hz = {RATE_HZ}
+[disks]
+left = "/disks/left"
+right = "/disks/right"
+segment_s = 1.5
+segment_mb = 10
+reserve_mb = 1
+[camera]
+backend = "simulated"
+width = 130
+height = 97
+""" + "".join(
+    f'[[cameras]]\nside = "{side}"\nname = "{name}"\naddress = "rig.sock#{side}_{name}"\n'
+    for side, name in itertools.product(SIDES, ("cam0", "cam1"))
+)
+SCRIPT = f"""
+mkdir -p /disks/left /disks/right
+mount /dev/vda /disks/left; mount /dev/vdb /disks/right
+mkfifo never; bash -c 'exec 3<> never; while :; do echo $EPOCHREALTIME > /artifacts/clock; read -t 0.05 -u 3; done' &
+cp /artifacts/wingcap.toml .
+{WINGSIM} rig --world /artifacts/world.toml --socket rig.sock --trigger-port trigger > rig 2>&1 & rig=$!
+until grep -q ready rig; do kill -0 $rig; sleep 0.1; done
+{WINGCAP} record --config wingcap.toml
+"""
+
+
+def wait_for_guest(clock: Path, since_ns: int, seconds: float) -> int:
+    """Wait until so much time has passed in the guest; its UTC nanoseconds, which it has just written to ``clock``."""
+    deadline_s = time.monotonic() + BOOT_S
+    now_ns = 0
+    while not now_ns or now_ns < since_ns + seconds * 1e9:
+        assert time.monotonic() < deadline_s, "the guest's clock stands still"
+        time.sleep(0.002)
+        text = clock.read_text() if clock.exists() else ""
+        if text.endswith("\n"):  # else it is just being written
+            now_ns = int(text.replace(".", "")) * 1000
+    return now_ns
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> World:
+    return World.make(seed=SEED, scale=SCALE)
+
+
+def make_disk(image: Path) -> None:
+    """An empty file system in a file."""
+    with image.open("wb") as file:
+        file.truncate(DISK_MB << 20)
+    subprocess.run([needs_program("mkfs.ext4"), "-q", "-F", "-E", "lazy_itable_init=0", image], check=True)
+
+
+def read_disk(image: Path, folder: Path) -> Path:
+    """What a computer would find on it: the journal is replayed, then everything copied out."""
+    checked = subprocess.run([needs_program("e2fsck"), "-f", "-y", image], capture_output=True, text=True)
+    assert checked.returncode in (0, 1), checked.stdout  # 1: mended, as at every mount after a cut
+    folder.mkdir()
+    subprocess.run([needs_program("debugfs"), "-R", f"rdump /cut {folder}", image], check=True, capture_output=True)
+    return folder / "cut"
+
+
+def cut(folder: Path, world: World, draw: random.Random, keep_some: bool) -> tuple[list[Path], int]:
+    """Record in a guest and cut its power; the flight's folders as found, and when it was (the guest's UTC)."""
+    artifacts = folder / "artifacts"
+    artifacts.mkdir(parents=True)
+    world.write(artifacts / "world.toml")
+    (artifacts / "wingcap.toml").write_text(CONFIG)
+    for side in SIDES:
+        make_disk(folder / f"{side}.img")
+    disks = [ForgetfulDisk(folder / f"{side}.img", folder / f"{side}.sock") for side in SIDES]
+    vm = Vm(SCRIPT, artifacts, ["virtio_blk", "ext4"], [disk.drive for disk in disks])
+    try:
+        vm.wait_for("recorded [1-9]", BOOT_S)
+        begin_ns = wait_for_guest(artifacts / "clock", 0, 0.0)
+        cut_ns = wait_for_guest(artifacts / "clock", begin_ns, draw.uniform(1.0, 4.0))
+        for disk in disks:
+            disk.cut(draw if keep_some else None)
+    finally:
+        vm.kill()
+        for disk in disks:
+            disk.close()
+    assert all(disk.flushes for disk in disks)
+    return [read_disk(folder / f"{side}.img", folder / side) for side in SIDES], cut_ns
+
+
+def check_pixels(folder: Path, world: World) -> int:
+    """Every frame is the one that the rig drew at its trigger; how many there are."""
+    noise: dict[tuple[int, float], list] = {}
+    renderers: dict[str, LiveRenderer] = {}
+    drawn = np.empty((world.sensor.height_px, world.sensor.width_px), np.uint8)
+    frames: dict[tuple[str, int], Frame] = {}
+    images: dict[tuple[str, int], np.ndarray] = {}
+    for path in sorted(folder.glob("*/*.mcap")):
+        with path.open("rb") as file:
+            for _, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+                place = "_".join(channel.topic.split("/")[1:3])
+                if channel.topic.endswith("/frame"):
+                    frames[place, message.sequence] = Frame.decode(message.data)
+                elif channel.topic.endswith("/image_raw"):
+                    image = decode_image(message.data)
+                    pixels = np.frombuffer(message.data, np.uint8)[image.pixels_at :][: image.pixels_size]
+                    images[place, message.sequence] = pixels.reshape(image.height, image.width)
+    assert frames.keys() == images.keys()
+    for (place, index), frame in frames.items():
+        if place not in renderers:
+            camera = next(camera for camera in world.cameras if camera.key == place)
+            key = (frame.exposure_us, frame.gain_db)
+            noise.setdefault(key, noise_frames(world, *key))
+            renderers[place] = LiveRenderer(world, camera, noise[key], *key)
+        renderers[place].render(frame.trigger_time_ns, drawn)
+        assert np.array_equal(drawn, images[place, index]), f"{place} trigger {index} shows something else"
+    return len(frames)
+
+
+def lost_before(camera: CameraReport, first_trigger_ns: int, cut_ns: int) -> float:
+    """Seconds from the trigger of the first frame that did not survive to the cut; 0 when none was yet due."""
+    assert not [loss for loss in camera.lost_indices.values() if loss.cause != CAUSE], "lost before the cut"
+    missing = next(index for index in itertools.count() if index not in camera.indices)
+    assert missing > max(camera.indices, default=-1), "a frame in the midst is missing"
+    return max(0.0, (cut_ns - first_trigger_ns) / 1e9 - missing / RATE_HZ)
+
+
+def test_a_power_cut_costs_less_than_a_second_and_nothing_reads_wrong(tmp_path, world, capsys):
+    draw = random.Random(SEED)
+    lost_s: list[float] = []
+    total = 0
+    for number in range(CUTS):
+        folders, cut_ns = cut(tmp_path / str(number), world, draw, keep_some=bool(number % 2))
+        copy = tmp_path / str(number) / "recovered"
+        recover_flight(folders, copy)
+        report = inspect([copy])
+        said = f"cut {number}, seed {SEED}"
+        assert report.problems == [], said
+        assert len(report.cameras) == 4, said
+        total += check_pixels(copy, world)
+        lost_s += [lost_before(camera, report.first_trigger_ns, cut_ns) for camera in report.cameras.values()]
+        assert max(lost_s) <= MOST_LOST_S, f"{said}: {lost_s[-4:]}"
+    with capsys.disabled():
+        print(f"\n{CUTS} power cuts (seed {SEED}): {total} frames came back, at most {max(lost_s):.2f} s were lost")
