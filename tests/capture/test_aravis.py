@@ -23,6 +23,7 @@ from capture.camera.aravis_library import LIBRARY
 from capture.camera.base import CameraSettings
 from capture.record import CAMERAS, SIDES, decode_image
 from capture.verify import inspect
+from hw_sim.gige import READOUT_NS
 from hw_sim.hand import do
 
 PLACES = [*itertools.product(SIDES, CAMERAS)]
@@ -41,7 +42,7 @@ def test_four_cameras_inside_the_library_at_a_flight_s_rate(tmp_path):
         assert all(account.balanced for account in accounts.values())
         recorded.append(sum(account.recorded for account in accounts.values()))
         shutil.rmtree(folder)
-        if recorded[-1] >= 4 * (count - 3):
+        if recorded[-1] >= 0.85 * 4 * count:  # all of them on a quiet machine
             return
     pytest.fail(f"of {4 * count} frames {recorded} were recorded")
 
@@ -126,6 +127,7 @@ backend = "aravis"
 width = {width}
 height = {height}
 exposure_us = 1500
+row_time_us = {READOUT_NS / 1000 / height:.3f}
 gain_db = 3.0
 black_level = 1.5
 shutter_mode = "GlobalReset"
@@ -169,8 +171,8 @@ def test_triggered_network_cameras_are_recorded_and_certified(gige, cameras, wid
 
 @pytest.mark.slow
 def test_lost_packets_are_booked_one_frame_each(gige):
-    rig = gige(2, 640, 480)
-    recorder = rig.start_recorder(100)
+    rig = gige(2, 640, 480, rate_hz=12.5)
+    recorder = rig.start_recorder(60)
     time.sleep(2.5)
     for deed in ("drop", "truncate", "drop", "truncate"):
         rig.do(deed, PLACES[1])
@@ -180,7 +182,7 @@ def test_lost_packets_are_booked_one_frame_each(gige):
     assert result["cameras"]["left/cam0"]["lost"] == {}
     assert result["cameras"]["left/cam1"]["lost"] == {"usb": 4}
     assert inspect([rig.folder]).problems == []
-    assert check_contents(rig) == 196
+    assert check_contents(rig) == 116
 
 
 @pytest.mark.slow

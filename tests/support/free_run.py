@@ -54,6 +54,7 @@ def record_free_running(
         lock_memory=False,
     )
     lanes = []
+    folder.mkdir(parents=True, exist_ok=True)
     for side, group in itertools.groupby(addresses, key=lambda place: place[0]):
         disk.make_folder(folder / side)
         lanes.append(make_lane(side, folder / side, {name: opened[side, name] for _, name in group}, parts))
