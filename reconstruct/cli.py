@@ -80,6 +80,9 @@ def run_command(
         typer.Option(help=f"Aerodynamic loads too, by these signals of the aircraft's acceleration: {NAMES}."),
     ] = None,
     csv: Annotated[bool, typer.Option(help="Write the tables as CSV too.")] = True,
+    mat: Annotated[bool, typer.Option(help="Write result.mat for MATLAB.")] = True,
+    mcap: Annotated[bool, typer.Option(help="Write wing.mcap, the wing in 3-D for Foxglove.")] = True,
+    netcdf: Annotated[bool, typer.Option(help="Write result.nc (NetCDF; needs xarray).")] = False,
     report: Annotated[bool, typer.Option(help="Draw the report; `reconstruct report` can do so later.")] = True,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
     scheduler: Annotated[
@@ -100,8 +103,9 @@ def run_command(
         raise UsageError(
             "--dbc is for a flight: a marker table has its signals beside it, from `wingproc markers --dbc`"
         )
+    also = tuple(name for name, wanted in (("mat", mat), ("mcap", mcap), ("netcdf", netcdf)) if wanted)
     job = Job(
-        *(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest, report, scheduler),
+        *(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest, also, report, scheduler),
         dbc=tuple(dbc or ()),
         max_gap_s=max_gap,
         specific_force=None if specific_force is None else parse_specific_force(specific_force),
