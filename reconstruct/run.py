@@ -20,6 +20,7 @@ from process.memory import MemoryWatch
 from process.parts import PartStore
 from process.pipeline import PipelineSettings
 from process.recording import Recording, find_files, open_recording
+from process.reference import Window
 from process.shared_error import with_rig
 from process.signal_table import MAX_GAP_S
 from process.tables import MARKER_SCHEMA, TableWriter, write_table
@@ -169,12 +170,14 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
     return summary, problems
 
 
-def run_comparison(result: Path, reference: Path, folder: Path, command: str) -> Comparison:
+def run_comparison(
+    result: Path, reference: Path, folder: Path, command: str, *, from_start: bool = False, window: Window | None = None
+) -> Comparison:
     """Compare, write comparison.json and the tables of errors into ``folder``, and the report with them.
 
     Raises UsageError when a folder or table is missing or cannot be used, or nothing of the two overlaps.
     """
-    comparison = compare(result, reference)
+    comparison = compare(result, reference, from_start=from_start, window=window)
     folder.mkdir(parents=True, exist_ok=True)
     write_table(comparison.shape_errors, folder / SHAPE_ERRORS, command=command)
     write_table(comparison.marker_errors, folder / MARKER_ERRORS, command=command)
