@@ -15,7 +15,7 @@ from capture.burst import give_burst, judge_burst
 from capture.camera.base import Camera, CameraDescription
 from capture.camera_place import camera_at, open_at
 from capture.clock import Clock
-from capture.config import Config, LoadedConfig
+from capture.config import Config, LoadedConfig, driver_buffers
 from capture.disk import Disk
 from capture.errors import DiskError
 from capture.flight import free_name, metadata_yaml
@@ -270,6 +270,7 @@ class Recording:
             triggers=self._triggers,
             clock=self._clock,
             ring_slots=self._config.ring_slots,
+            driver_buffers=driver_buffers(self._config.trigger.rate_hz),
             lock_memory=self._config.ring.lock_memory,
             threads=self._config.threads,
             calibration=self._calibration(),

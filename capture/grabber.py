@@ -37,8 +37,9 @@ class SideGate:
 
     _REMEMBERED = 64
 
-    def __init__(self, rings: list[Ring]) -> None:
+    def __init__(self, rings: list[Ring], driver_buffers: int = DRIVER_BUFFERS) -> None:
         self._rings = rings
+        self._driver_buffers = driver_buffers
         self._promised: dict[int, set[int]] = {id(ring): set() for ring in rings}
         self._decisions: dict[int, bool] = {}
         self._mutex = threading.Lock()
@@ -56,7 +57,7 @@ class SideGate:
             return ring.take()
 
     def _decide(self, index: int) -> None:
-        room = all(ring.free > min(len(self._promised[id(ring)]), DRIVER_BUFFERS) for ring in self._rings)
+        room = all(ring.free > min(len(self._promised[id(ring)]), self._driver_buffers) for ring in self._rings)
         self._decisions[index] = room
         if room:
             for promised in self._promised.values():
@@ -75,6 +76,7 @@ class ReadParts:
     ledger: Ledger
     triggers: Triggers
     clock: Clock
+    driver_buffers: int = DRIVER_BUFFERS
     clock_state: Callable[[], ClockState] = lambda: FREE_RUNNING  # of this computer, asked for each frame
     trigger_latency_ns: int = 0  # from a trigger to the start of row 0's exposure
     judge: Callable[[str, str | None], None] = lambda name, cause: None  # marks what is not in order: capture.gates
@@ -115,6 +117,7 @@ class Grabber(Worker):
         self.seek_error = ""  # why the last try to have the camera back failed
         self.temperature_c: float | None = None
         self._camera = camera
+        self._driver_buffers = parts.driver_buffers
         self._description = description
         self._layout = layout
         self._gate = gate
@@ -134,7 +137,7 @@ class Grabber(Worker):
 
     def arm(self) -> None:
         """Give the driver its buffers and make the camera ready for triggers. Before ``start``."""
-        while len(self._slots) < DRIVER_BUFFERS and (slot := self.ring.take()) is not None:
+        while len(self._slots) < self._driver_buffers and (slot := self.ring.take()) is not None:
             self._slots.add(slot)
         for slot in sorted(self._slots):
             self._queue(slot)

@@ -90,7 +90,7 @@ def make_lane(
         for name in names
     }
     rings = {name: Ring(parts.ring_slots, layouts[name].slot_bytes, parts.lock_memory) for name in names}
-    gate = SideGate(list(rings.values()))
+    gate = SideGate(list(rings.values()), parts.driver_buffers)
     grabbers = {
         name: Grabber((side, name), camera, description, rings[name], layouts[name], gate, recorder, parts)
         for name, (camera, description) in cameras.items()
