@@ -4,6 +4,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +20,7 @@ from process.calibrate import CalibrationSettings, Method, calibration_covarianc
 from process.calibration_report import write_report
 from process.calibration_session import SessionCalibration, calibrate_session, find_session, image_pairs
 from process.camera_model import write_pair
+from process.charuco import dictionary
 from process.json_file import finite_or_none, provenance
 
 RANGES_M = (1.0, 2.0, 3.0)
@@ -32,6 +34,10 @@ def calibrate(
     board: Annotated[str, typer.Option(help="Inner corners of the checkerboard, such as 10x7.")],
     square_mm: Annotated[float, typer.Option(help="Side of one square.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The pair's file to write (JSON).")],
+    charuco: Annotated[
+        str | None, typer.Option(help="The board is a ChArUco one with markers of this dictionary, such as 4X4_50.")
+    ] = None,
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a ChArUco board's marker.")] = None,
     method: Annotated[
         Method, typer.Option(help="Everything at once, or the paper's way: each camera alone, then the pose between.")
     ] = Method.joint,
@@ -48,7 +54,7 @@ def calibrate(
     """Calibrate a camera pair from images of a checkerboard seen by both cameras at the same time."""
     if distortion_terms not in (2, 5):
         raise UsageError(f"--distortion-terms {distortion_terms}: 2 or 5")
-    target = Board.parse(board, square_mm)
+    target = _board(board, square_mm, charuco, marker_mm)
     pairs = image_pairs(cam0, cam1)
     for path in filter(None, (output, report)):
         if not path.resolve().parent.is_dir():
@@ -81,12 +87,28 @@ def calibrate(
         _print(summary, output, report)
 
 
+def _board(size: str, square_mm: float, charuco: str | None, marker_mm: float | None) -> Board:
+    board = Board.parse(size, square_mm)
+    if charuco is None:
+        if marker_mm is not None:
+            raise UsageError("--marker-mm is a ChArUco board's: give its --charuco dictionary, too")
+        return board
+    if marker_mm is None or not 0.0 < marker_mm < square_mm:
+        raise UsageError(f"--charuco {charuco}: give --marker-mm, the side of a marker, smaller than the square's")
+    try:
+        dictionary(charuco)
+    except KeyError:
+        raise UsageError(f"--charuco {charuco}: OpenCV has no such dictionary; 4X4_50 or 5X5_100 are some") from None
+    return replace(board, charuco=charuco, marker_m=marker_mm / 1000.0)
+
+
 def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
     """What is printed, and written beside the parameters."""
     calibration = result.calibration
     pair = calibration.pair
     view_rms_px = np.sqrt(np.nanmean(np.sum(calibration.residuals_px**2, axis=-1), axis=2))
     print_error = calibration.board_m - board.points_m
+    names = result.seen
     return {
         "cameras": [
             {
@@ -109,6 +131,15 @@ def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
             "finders": list(result.finders),
             "finder_rms_px": list(result.finder_rms_px),
             "predicted_sigma_mm": _predicted_sigma_mm(result),
+            "odd_corners": [
+                {
+                    "view": str(names[view][camera]),
+                    "column": corner % board.columns + 1,
+                    "row": corner // board.columns + 1,
+                    "residual_px": off_px,
+                }
+                for camera, view, corner, off_px in calibration.odd_corners
+            ],
             "warnings": calibration.warnings,
         },
         "board": {
@@ -149,6 +180,11 @@ def _print(summary: dict[str, Any], output: Path, report: Path | None) -> None:
     for view in summary["views"]:
         if not view["used"]:
             say(f"  left out   {Path(view['cam0']).name}, {Path(view['cam1']).name}: {view['reason']}")
+    for odd in detail["odd_corners"]:
+        place = f"column {odd['column']}, row {odd['row']}"
+        say(
+            f"  left out   corner {place} of {Path(odd['view']).name}: {odd['residual_px']:.2f} px off, hidden or a gleam?"
+        )
     say("             RMS px   alone px        fx        fy        cx        cy")
     for name, camera in zip(("cam0", "cam1"), summary["cameras"], strict=True):
         K = camera["K"]
