@@ -182,9 +182,8 @@ def _print(summary: dict[str, Any], output: Path, report: Path | None) -> None:
             say(f"  left out   {Path(view['cam0']).name}, {Path(view['cam1']).name}: {view['reason']}")
     for odd in detail["odd_corners"]:
         place = f"column {odd['column']}, row {odd['row']}"
-        say(
-            f"  left out   corner {place} of {Path(odd['view']).name}: {odd['residual_px']:.2f} px off, hidden or a gleam?"
-        )
+        name = Path(odd["view"]).name
+        say(f"  left out   {name}, corner at {place}: {odd['residual_px']:.2f} px off, hidden or a gleam")
     say("             RMS px   alone px        fx        fy        cx        cy")
     for name, camera in zip(("cam0", "cam1"), summary["cameras"], strict=True):
         K = camera["K"]

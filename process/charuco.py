@@ -29,7 +29,7 @@ def find_charuco(path: Path, image: Image, board: Board) -> View:
     ``subpix`` is OpenCV's own, ``edges`` the maximum-likelihood fit in a window that ends before the markers.
     """
     found = _by_opencv(image, board)
-    seen = np.isfinite(found).all(axis=1)
+    seen = np.asarray(np.isfinite(found).all(axis=1))
     if seen.sum() < max(LEAST_CORNERS, LEAST_PART * board.corners) or _in_a_line(board.points_m[seen]):
         return View(
             path, {}, f"{int(seen.sum())} corners of the {board.columns}x{board.rows} ChArUco board found, too few"

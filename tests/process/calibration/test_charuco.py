@@ -17,7 +17,7 @@ BOARD = Board(10, 7, 0.03, "4X4_50", 0.022)
 CAMERA = CameraModel(1040, 776, [[1350.0, 0, 520.9], [0, 1351.8, 385.7], [0, 0, 1]], [-0.11, 0.14, -3e-4, 6e-4, 0.0])
 PAIR = StereoPair(CAMERA, CAMERA, pose_matrix([0.004, -0.05, 0.003], [-0.2794, 0.001, -0.0005]))
 SCALE = 2000.0  # pixels a metre of the drawing
-SUPERSAMPLING = 3
+SUPERSAMPLING = 2
 
 
 def drawing(board, legacy=False):
