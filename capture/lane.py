@@ -39,7 +39,8 @@ class Lane:
         """Start the write thread, arm the cameras, start the read threads."""
         self.recorder.start()
         for grabber in self.grabbers.values():
-            grabber.arm()
+            if not grabber.is_absent:
+                grabber.arm()
             grabber.start()
 
 
