@@ -17,23 +17,29 @@ from capture.console import note, say, say_json
 from capture.errors import ProcessError, UsageError
 from process.board import Board
 from process.calibrate import CalibrationSettings, Method, calibration_covariance_m2
+from process.calibration_recording import find_in_recording
 from process.calibration_report import write_report
 from process.calibration_session import SessionCalibration, calibrate_session, find_session, image_pairs
 from process.camera_model import write_pair
 from process.charuco import dictionary
 from process.json_file import finite_or_none, provenance
+from process.recording import Recording, open_recording
 
 RANGES_M = (1.0, 2.0, 3.0)
 
 
 def calibrate(
-    cam0: Annotated[
-        str, typer.Option(help="Images of the left camera: a quoted pattern such as 'A*.png', or a folder.")
-    ],
-    cam1: Annotated[str, typer.Option(help="Images of the right camera, in the same order.")],
     board: Annotated[str, typer.Option(help="Inner corners of the checkerboard, such as 10x7.")],
     square_mm: Annotated[float, typer.Option(help="Side of one square.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The pair's file to write (JSON).")],
+    flight: Annotated[
+        list[Path] | None, typer.Argument(help="A recording in which a board is held still in many places, one by one.")
+    ] = None,
+    side: Annotated[str | None, typer.Option(help="Of a recording: the pair to calibrate, left or right.")] = None,
+    cam0: Annotated[
+        str | None, typer.Option(help="Images of the left camera: a quoted pattern such as 'A*.png', or a folder.")
+    ] = None,
+    cam1: Annotated[str | None, typer.Option(help="Images of the right camera, in the same order.")] = None,
     charuco: Annotated[
         str | None, typer.Option(help="The board is a ChArUco one with markers of this dictionary, such as 4X4_50.")
     ] = None,
@@ -51,21 +57,25 @@ def calibrate(
     workers: Annotated[int, typer.Option(min=1, max=2, help="Processes that look for corners.")] = 2,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Calibrate a camera pair from images of a checkerboard seen by both cameras at the same time."""
+    """Calibrate a camera pair from images, or a recording, of a board seen by both cameras at the same time."""
     if distortion_terms not in (2, 5):
         raise UsageError(f"--distortion-terms {distortion_terms}: 2 or 5")
     target = _board(board, square_mm, charuco, marker_mm)
-    pairs = image_pairs(cam0, cam1)
+    source = _source(flight or [], side, cam0, cam1)
     for path in filter(None, (output, report)):
         if not path.resolve().parent.is_dir():
             raise ProcessError(f"{path.parent}: no such folder to write to; make it first")
     with _progress() as progress:
-        session = find_session(pairs, target, workers, progress)
+        if isinstance(source, list):
+            session = find_session(source, target, workers, progress)
+        else:
+            session = find_in_recording(*source, target, workers, progress)
     settings = CalibrationSettings(method, nominal_board, distortion_terms)
     result = calibrate_session(session, settings)
     summary = summarise(result, target)
     command = shlex.join(["wingproc", *sys.argv[1:]])
-    made = provenance(command, [path for pair in pairs for path in pair])
+    # of a recording the command says which; its files are too large to be hashed here
+    made = provenance(command, [path for pair in source for path in pair] if isinstance(source, list) else [])
     calibration = result.calibration
     write_pair(
         output,
@@ -85,6 +95,23 @@ def calibrate(
         say_json({**summary, "output": str(output)})
     else:
         _print(summary, output, report)
+
+
+def _source(
+    flight: list[Path], side: str | None, cam0: str | None, cam1: str | None
+) -> list[tuple[Path, Path]] | tuple[Recording, str]:
+    """Pairs of image files, or a recording and a side of it. UsageError when it is neither or both."""
+    if flight:
+        if cam0 or cam1:
+            raise UsageError("give a recording, or --cam0 and --cam1, not both")
+        if side not in ("left", "right"):
+            raise UsageError("a recording needs --side left or --side right: the pair to calibrate")
+        return open_recording(flight), side
+    if side is not None:
+        raise UsageError("--side is of a recording: name its folder")
+    if not cam0 or not cam1:
+        raise UsageError("give --cam0 and --cam1, images of both cameras, or a recording's folder with --side")
+    return image_pairs(cam0, cam1)
 
 
 def _board(size: str, square_mm: float, charuco: str | None, marker_mm: float | None) -> Board:
