@@ -39,8 +39,7 @@ class Lane:
         """Start the write thread, arm the cameras, start the read threads."""
         self.recorder.start()
         for grabber in self.grabbers.values():
-            if not grabber.is_absent:
-                grabber.arm()
+            grabber.arm()
             grabber.start()
 
 
@@ -91,7 +90,7 @@ def make_lane(
         for name in names
     }
     rings = {name: Ring(parts.ring_slots, layouts[name].slot_bytes, parts.lock_memory) for name in names}
-    gate = SideGate(list(rings.values()), parts.driver_buffers)
+    gate = SideGate(list(rings.values()))
     grabbers = {
         name: Grabber((side, name), camera, description, rings[name], layouts[name], gate, recorder, parts)
         for name, (camera, description) in cameras.items()

@@ -42,24 +42,10 @@ def by_dome(side: RigSide, points_m: Array, normals: Array) -> Array:
 
     Each camera sees the light elsewhere; the point nearest to both in pixels is what triangulation makes of it.
     """
-    T = side.T_body_cam0
-    points = np.asarray(points_m, np.float64).reshape(-1, 3)
-    in_cam0 = (points - T[:3, 3]) @ T[:3, :3]
-    T10 = side.pair.T_cam1_cam0
-    in_cam1 = in_cam0 @ T10[:3, :3].T + T10[:3, 3]
-    R1 = T[:3, :3] @ T10[:3, :3].T  # cam1's axes in the body frame
-    slopes, moved = [], []
-    for camera, seen, R in ((side.pair.cam0, in_cam0, T[:3, :3]), (side.pair.cam1, in_cam1, R1)):
-        slope = camera.project_with_jacobian(seen)[1] @ R.T
-        towards = -(seen / np.linalg.norm(seen, axis=1, keepdims=True)) @ R.T
-        cosine = np.sum(towards * normals, axis=1, keepdims=True)
-        across = normals - cosine * towards
-        offset = across * np.linalg.norm(across, axis=1, keepdims=True) / (1.0 + cosine)
-        slopes.append(slope)
-        moved.append((slope @ offset[:, :, None])[:, :, 0])
-    by_point, by_b = np.concatenate(slopes, axis=1), np.concatenate(moved, axis=1)
+    slopes, moved = _dome_in_images(side, points_m, normals)
+    by_point, by_b = slopes.reshape(-1, 4, 3), moved.reshape(-1, 4)
     good = np.isfinite(by_point).all(axis=(1, 2)) & np.isfinite(by_b).all(axis=1)
-    response = np.full((len(points), 3), np.nan)
+    response = np.full((len(by_point), 3), np.nan)
     response[good] = (np.linalg.pinv(by_point[good]) @ by_b[good, :, None])[:, :, 0]
     return response
 
@@ -70,6 +56,26 @@ def centres_m(side: RigSide, light: Light, points_m: Array, normals: Array) -> A
         return points_m
     shift = DOME * light.dome_radius_m * by_dome(side, points_m, normals)
     return np.asarray(points_m - np.where(np.isfinite(shift), shift, 0.0))
+
+
+def centre_pixels(side: RigSide, layout: MarkerLayout, side_name: str, lights_m: Array, pixels: Array) -> Array:
+    """Pixels (F, M, 2, 2) of marker, camera, (u, v), as they would be of the lights' centres.
+
+    Args:
+        side: the cameras.
+        layout: of the M markers.
+        side_name: left or right.
+        lights_m: (F, M, 3) their places, body frame; NaN where not both cameras saw one: made up for by its row.
+        pixels: as seen; what no place or normal is known of stays as it is.
+    """
+    if layout.light.dome_radius_m == 0.0 or len(layout.pairs_station_m) < LEAST_PAIRS:
+        return pixels
+    stations = np.array(layout.pairs_station_m)
+    whole = np.stack([_completed(lights_m[:, row::2], stations) for row in (0, 1)], axis=2).reshape(lights_m.shape)
+    normals = wing_normals(side_name, layout, whole)
+    _, by_b = _dome_in_images(side, whole.reshape(-1, 3), normals.reshape(-1, 3))
+    shift = DOME * layout.light.dome_radius_m * by_b.reshape(pixels.shape)
+    return np.asarray(pixels - np.where(np.isfinite(shift), shift, 0.0))
 
 
 def bases_m(light: Light, centres: Array, normals: Array) -> Array:
@@ -85,6 +91,26 @@ def light_covariance(light: Light) -> Array:
 def by_light(side: RigSide, points_m: Array, normals: Array) -> Array:
     """(N, 3, 2) places on the surface by the errors of stand-off and b."""
     return np.stack([-normals, -by_dome(side, points_m, normals)], axis=2)
+
+
+def _dome_in_images(side: RigSide, points_m: Array, normals: Array) -> tuple[Array, Array]:
+    """(N, 2, 2, 3) pixels in both cameras by the place of lights (N, 3), and (N, 2, 2) by a metre of b."""
+    T = side.T_body_cam0
+    points = np.asarray(points_m, np.float64).reshape(-1, 3)
+    in_cam0 = (points - T[:3, 3]) @ T[:3, :3]
+    T10 = side.pair.T_cam1_cam0
+    in_cam1 = in_cam0 @ T10[:3, :3].T + T10[:3, 3]
+    R1 = T[:3, :3] @ T10[:3, :3].T  # cam1's axes in the body frame
+    slopes, moved = [], []
+    for camera, seen, R in ((side.pair.cam0, in_cam0, T[:3, :3]), (side.pair.cam1, in_cam1, R1)):
+        slope = camera.project_with_jacobian(seen)[1] @ R.T
+        towards = -(seen / np.linalg.norm(seen, axis=1, keepdims=True)) @ R.T
+        cosine = np.sum(towards * normals, axis=1, keepdims=True)
+        across = normals - cosine * towards
+        offset = across * np.linalg.norm(across, axis=1, keepdims=True) / (1.0 + cosine)
+        slopes.append(slope)
+        moved.append((slope @ offset[:, :, None])[:, :, 0])
+    return np.stack(slopes, axis=1), np.stack(moved, axis=1)
 
 
 def _completed(row_m: Array, stations: Array) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from process.bent_wing import BentWing
 from process.camera_model import MarkerLayout, RigSide
 from process.detect import Detections
 from process.triangulate import Points, Rays, epipolar_distance_px, rays, rectified_pixels, triangulate_rays
@@ -41,6 +42,8 @@ class MatchSettings:
     """squared Mahalanobis distance from which "not seen" is the better explanation"""
     least_margin: float = 6.0
     """a runner-up closer than this, in squared Mahalanobis distance, makes a marker ``ambiguous``"""
+    lone_sigma_m: float = 0.002
+    """least sigma of the place, along each axis, where a light that one camera saw is looked for"""
     stretch_m: float = 0.002
     """one sigma of the distance between neighbouring lights, besides the spots' noise: a wing bends, it does not …"""
     stretch: float = 0.004
@@ -84,6 +87,8 @@ class Matches:
     """all spots of cam0 and cam1, taken through the lens; None where nothing was matched"""
     points: Points | None = None
     """of the seen markers, in their order, by least reprojection error; None where matching did not need them"""
+    followed_m: Array | None = None
+    """(M, 3) where the track, bent to what was seen, has the markers, body frame; None where no track was followed"""
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -177,8 +182,9 @@ def match_sighting(
     detections, candidates = sighting.detections, sighting.candidates
     if candidates is None:
         return _match_by_rows(side, layout, *sighting.rays)
-    wing = _Wing(side_name, layout)
-    result = None if track is None else _follow(wing, candidates, track, trigger_index, settings)
+    wing = BentWing(side_name, layout)
+    followed = None if track is None else _follow(wing, candidates, track, trigger_index, settings)
+    result = followed
     if result is None or _leaves_spots(result[0], detections):
         fresh = _start(wing, candidates, settings)
         if result is None or _total(fresh[0], fresh[2], settings) < _total(result[0], result[2], settings):
@@ -197,6 +203,7 @@ def match_sighting(
         next_track,
         sighting.rays,
         _points(candidates, chosen[seen]),
+        None if followed is None or not np.array_equal(followed[0], chosen) else followed[1],
     )
 
 
@@ -212,52 +219,7 @@ def _split(whole: Rays, counts: Sequence[int]) -> list[Rays]:
 
 def wing_places_m(side_name: str, layout: MarkerLayout, tip_slope_rad: float) -> Array:
     """(M, 3) markers, body frame, of a wing bent like a cantilever under an even load to a slope at the tip."""
-    return _Wing(side_name, layout).bent(tip_slope_rad)
-
-
-class _Wing:
-    """A half wing's markers in the section's coordinates, and the directions span, chord, normal."""
-
-    def __init__(self, side_name: str, layout: MarkerLayout) -> None:
-        self.outboard = 1.0 if side_name == "right" else -1.0
-        pairs = np.array(layout.pairs_station_m, dtype=np.float64)
-        self.station_m = np.repeat(pairs, 2)
-        self.chord_m = np.tile(np.array(layout.chord_m, dtype=np.float64), len(pairs))
-        self.height_m = layout.height_m
-        self.span_m = float(pairs[-1])
-        self.count = len(self.station_m)
-        self.offset_m = np.stack([self.station_m, self.chord_m], axis=1)
-        # columns of what the wing can be bent by: s … s⁴ along the axis, and c, c s, c s² for its sections
-        s, c = self.station_m / self.span_m, self.chord_m / 0.1
-        self.basis = np.stack([s, s**2, s**3, s**4, c, c * s, c * s**2], axis=1)
-
-    def bent(self, tip_slope_rad: float) -> Array:
-        """(M, 3) markers of a wing whose slope grows to ``tip_slope_rad`` as a cantilever's under an even load."""
-        fine = np.linspace(0.0, self.span_m, 200)
-        slope = tip_slope_rad * (1.0 - (1.0 - fine / self.span_m) ** 3)
-        step = np.diff(fine, prepend=0.0)
-        y = np.interp(self.station_m, fine, np.cumsum(np.cos(slope) * step))
-        z = np.interp(self.station_m, fine, np.cumsum(np.sin(slope) * step))
-        at = np.interp(self.station_m, fine, slope)
-        y, z = y - self.height_m * np.sin(at), z + self.height_m * np.cos(at)
-        return np.stack([-self.chord_m, self.outboard * y, z], axis=1)
-
-    def directions(self, places_m: Array) -> Array:
-        """(M, 3, 3) rows span, chord, normal of a wing whose markers are at ``places_m``."""
-        middles = (places_m[0::2] + places_m[1::2]) / 2.0
-        along = np.gradient(middles, axis=0)
-        span = np.repeat(along / np.linalg.norm(along, axis=1)[:, None], 2, axis=0)
-        chord = np.broadcast_to(np.array([-1.0, 0.0, 0.0]), span.shape)
-        chord = chord - np.sum(chord * span, axis=1)[:, None] * span
-        chord = chord / np.linalg.norm(chord, axis=1)[:, None]
-        return np.stack([span, chord, np.cross(span, chord)], axis=1)
-
-    def bend_to(self, places_m: Array, measured_m: Array, seen: NDArray[np.bool_]) -> Array:
-        """``places_m`` moved smoothly to ``measured_m`` where ``seen``; a weak pull keeps it from running off."""
-        pull = np.array([0.02, 0.03, 0.05, 0.08, 0.05, 0.05, 0.08])
-        A = np.concatenate([self.basis[seen], np.diag(pull)])
-        b = np.concatenate([(measured_m - places_m)[seen], np.zeros((len(pull), 3))])
-        return np.asarray(places_m + self.basis @ np.linalg.lstsq(A, b, rcond=None)[0])
+    return BentWing(side_name, layout).bent(tip_slope_rad)
 
 
 _Result = tuple[Indices, Array, Array]  # chosen candidate, predicted places, cost matrix (markers × candidates)
@@ -308,7 +270,7 @@ def _candidates(
     return candidates
 
 
-def _start(wing: _Wing, candidates: _Candidates, settings: MatchSettings) -> _Result:
+def _start(wing: BentWing, candidates: _Candidates, settings: MatchSettings) -> _Result:
     """The best of several bends, each assigned loosely; the three best are refined."""
     tried = []
     for slope in _TIP_SLOPES_RAD:
@@ -324,7 +286,7 @@ def _start(wing: _Wing, candidates: _Candidates, settings: MatchSettings) -> _Re
 
 
 def _follow(
-    wing: _Wing, candidates: _Candidates, track: Track, trigger_index: int, settings: MatchSettings
+    wing: BentWing, candidates: _Candidates, track: Track, trigger_index: int, settings: MatchSettings
 ) -> _Result | None:
     """Assignment to the track moved on; None if it explains less than half of the wing."""
     gap = trigger_index - track.trigger_index
@@ -342,7 +304,7 @@ def _follow(
 
 
 def _refined(
-    wing: _Wing,
+    wing: BentWing,
     candidates: _Candidates,
     places: Array,
     chosen: Indices,
@@ -360,7 +322,7 @@ def _refined(
 
 
 def _assigned(
-    wing: _Wing, candidates: _Candidates, places: Array, sigma_m: Sequence[float], none_cost: float
+    wing: BentWing, candidates: _Candidates, places: Array, sigma_m: Sequence[float], none_cost: float
 ) -> tuple[Indices, Array]:
     """(M,) candidate of each marker and the costs (M, C); every spot is used at most once in each image."""
     apart = candidates.xyz_m[None, :, :] - places[:, None, :]
@@ -436,7 +398,7 @@ def _margins(candidates: _Candidates, chosen: Indices, cost: Array, none_cost: f
     return margin
 
 
-def _odd_ones(wing: _Wing, candidates: _Candidates, chosen: Indices, settings: MatchSettings) -> NDArray[np.bool_]:
+def _odd_ones(wing: BentWing, candidates: _Candidates, chosen: Indices, settings: MatchSettings) -> NDArray[np.bool_]:
     """(M,) seen markers that are unlike the rest, as a false pair of spots in a missing marker's place is.
 
     A false pair has any place along a ray, and any epipolar distance within the gate. True lights keep their distances

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from capture.errors import ProcessError
 from process.bulb import centres_m, wing_normals
@@ -22,16 +23,18 @@ from process.camera_model import MarkerLayout, Rig, RigSide
 from process.detect import Detections, DetectSettings, detect_all
 from process.flight_cameras import check_cameras
 from process.fuselage_lights import without_lights
+from process.lone_spots import lone_spots
 from process.match import UNSEEN, Matches, MatchSettings, Sighting, Track, match_sighting, sightings
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
-from process.set_time import marker_instants_ns, ptp_state, set_instant_ns, time_sigma_ns
-from process.tables import MARKER_SCHEMA
+from process.set_time import camera_instants_ns, marker_instants_ns, ptp_state, set_instant_ns, time_sigma_ns
+from process.tables import MARKER_SCHEMA, PIXEL_COVARIANCES, ROW_TIMES
 from process.triangulate import Method, triangulate_as
 from process.workers import Shared, crew, usable_cores
 
 BLOCK_TRIGGERS = 50
 GROUP_SETS = 5  # measured together: reads are large, and what a call costs is shared
 BLOCKS_WORTH_A_PROCESS = 4  # starting one costs as much as processing a block or two
+Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 
@@ -257,19 +260,24 @@ def _append(
     """Add a row for each marker of a frame set."""
     count = len(matched.spot0)
     rows = np.flatnonzero(matched.seen)
-    pixels = np.full((2, count, 2), np.nan)
+    spots = np.stack([matched.spot0, matched.spot1])
     numbers = {"xyz": np.full((count, 3), np.nan), "cov": np.full((count, 3, 3), np.nan)}
     epipolar_px = np.full(count, np.nan)
     flags = ["no_frame" if found is None else "not_seen"] * count
     frame_ns = set_instant_ns(frames, side)
     timestamps_ns = np.full(count, frame_ns, dtype=np.int64)
+    if found is not None:
+        lone = lone_spots(frames.side, side, layout, found, matched, settings.matching)
+        spots = np.where(lone.seen, lone.spot, spots)
+        for row in np.flatnonzero(lone.seen):
+            flags[row] = _flag("one_camera", "ambiguous" if lone.ambiguous[row] else "", *_said(found, spots[:, row]))
+    pixels, spread = _centroids(found, spots)
+    own_ns = camera_instants_ns(frames, side, pixels)
     if found is not None and rows.size:
-        spots = matched.spot0[rows], matched.spot1[rows]
-        pixels[0, rows], pixels[1, rows] = found[0].pixels[spots[0]], found[1].pixels[spots[1]]
         assert matched.rays is not None
         points = matched.points
         if points is None or settings.triangulation != "default":
-            rays = matched.rays[0][spots[0]], matched.rays[1][spots[1]]
+            rays = matched.rays[0][spots[0, rows]], matched.rays[1][spots[1, rows]]
             points = triangulate_as(settings.triangulation, side, *rays)
         numbers["xyz"][rows], numbers["cov"][rows] = points.xyz_m, points.covariance_m2
         if layout.light.dome_radius_m > 0.0:
@@ -277,10 +285,10 @@ def _append(
             numbers["xyz"][rows] = centres_m(side, layout.light, points.xyz_m, normals[rows])
         epipolar_px[rows] = points.epipolar_px
         timestamps_ns[rows] = marker_instants_ns(frames, side, pixels[0, rows, 1], pixels[1, rows, 1])
-        for row, spot0, spot1, reason in zip(rows, *spots, points.reasons, strict=True):
-            said = {reason, *found[0].flags[spot0].split(","), *found[1].flags[spot1].split(",")}
-            said |= {"ambiguous"} if matched.ambiguous[row] else set()
-            flags[row] = ",".join(sorted(said - {""}))
+        for row, reason in zip(rows, points.reasons, strict=True):
+            flags[row] = _flag(reason, "ambiguous" if matched.ambiguous[row] else "", *_said(found, spots[:, row]))
+    alone = (spots != UNSEEN).sum(axis=0) == 1
+    timestamps_ns[alone] = np.where(spots[0] != UNSEEN, *own_ns)[alone]
     columns = into.columns
     columns["trigger_index"].append(np.full(count, frames.trigger_index, dtype=np.int64))
     columns["side"].append(np.full(count, frames.side))
@@ -294,10 +302,35 @@ def _append(
         for m in range(k, 3):
             columns[f"cov_{axis}{'xyz'[m]}_m2"].append(numbers["cov"][:, k, m])
     for camera in range(2):
-        columns[f"u{camera}_px"].append(pixels[camera, :, 0])
-        columns[f"v{camera}_px"].append(pixels[camera, :, 1])
+        columns[ROW_TIMES[camera]].append(own_ns[camera])
+        for at, axis in enumerate("uv"):
+            columns[f"{axis}{camera}_px"].append(pixels[camera, :, at])
+        for at, axes in enumerate(((0, 0), (0, 1), (1, 1))):
+            columns[PIXEL_COVARIANCES[3 * camera + at]].append(spread[camera, :, *axes])
     columns["epipolar_px"].append(epipolar_px)
     columns["flags"].append(np.array(flags, dtype=object))
+
+
+def _centroids(found: tuple[Detections, Detections] | None, spots: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Pixels (2, M, 2) and covariances (2, M, 2, 2) of the spots (2, M); NaN where there is none."""
+    pixels, spread = np.full((*spots.shape, 2), np.nan), np.full((*spots.shape, 2, 2), np.nan)
+    for camera in range(2 if found is not None else 0):
+        assert found is not None
+        there = spots[camera] != UNSEEN
+        pixels[camera, there] = found[camera].pixels[spots[camera, there]]
+        spread[camera, there] = found[camera].covariance_px2[spots[camera, there]]
+    return pixels, spread
+
+
+def _said(found: tuple[Detections, Detections], spots: NDArray[np.intp]) -> list[str]:
+    """What detection has to say of a marker's spots (2,)."""
+    return [
+        flag for camera, spot in enumerate(spots) if spot != UNSEEN for flag in found[camera].flags[spot].split(",")
+    ]
+
+
+def _flag(*reasons: str) -> str:
+    return ",".join(sorted({*reasons} - {""}))
 
 
 def _table(into: _Rows) -> pa.Table:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from capture.errors import ProcessError, UsageError
 from process.recording import FrameSetReader, Recording, SetPlaces
 from process.shared_error import METADATA_KEY, point_covariance_m2, sides_of
-from process.tables import MARKER_SCHEMA
+from process.tables import DIRECT_COLUMNS, MARKER_SCHEMA
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ _AXES = tuple("xyz"[i] + "xyz"[j] for i, j in _TRIANGLE)
 
 REFERENCE_SCHEMA: pa.Schema = pa.schema(
     [
-        *MARKER_SCHEMA,
+        *(member for member in MARKER_SCHEMA if member.name not in DIRECT_COLUMNS),
         ("sets", pa.int32()),
         ("scatter_m", pa.float64()),
         ("moved_m", pa.float64()),

@@ -42,6 +42,18 @@ def marker_instants_ns(
     return np.rint(rows_ns + apart_ns / 2.0).astype(np.int64) + moment0
 
 
+def camera_instants_ns(frames: FrameSet, side: RigSide, pixels: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(2, n) mid-exposure, UTC, of the rows of ``pixels`` (2, n, 2) in cam0 and cam1; the set's instant where NaN."""
+    instants = np.full(pixels.shape[:2], set_instant_ns(frames, side), dtype=np.int64)
+    for own, moment, row_time, rows in zip(
+        instants, frames.mid_exposures_ns, row_times_ns(frames, side), pixels[:, :, 1], strict=True
+    ):
+        there = np.isfinite(rows)
+        if moment is not None:
+            own[there] = moment + np.rint(rows[there] * row_time).astype(np.int64)
+    return instants
+
+
 def row_times_ns(frames: FrameSet, side: RigSide) -> tuple[float, float]:
     """Of each camera: as recorded, or the rig's where the recording does not say (0: few cameras know their own)."""
     frame0, frame1 = (0.0 if frame is None else float(frame.row_time_ns) for frame in frames.frames)

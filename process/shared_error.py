@@ -127,10 +127,16 @@ def sides_of(table: pa.Table) -> dict[str, RigSide]:
     return {name: RigSide.from_dict(note[name]) for name in ("left", "right") if name in note}
 
 
+def layout_of(table: pa.Table) -> MarkerLayout | None:
+    """The markers that the marker table was measured with; None for tables that do not say (a truth's)."""
+    note: dict[str, Any] = json.loads((table.schema.metadata or {}).get(METADATA_KEY, b"{}"))
+    return MarkerLayout.from_dict(note["markers"]) if "markers" in note else None
+
+
 def light_of(table: pa.Table) -> Light:
     """The lights that the marker table was measured from; without errors for tables that do not say (a truth's)."""
-    note: dict[str, Any] = json.loads((table.schema.metadata or {}).get(METADATA_KEY, b"{}"))
-    return MarkerLayout.from_dict(note["markers"]).light if "markers" in note else Light()
+    layout = layout_of(table)
+    return Light() if layout is None else layout.light
 
 
 def _carried(side: RigSide, jacobian: Array, surface: Surface | None) -> Array:

@@ -16,6 +16,10 @@ from process.json_file import provenance
 PROVENANCE_KEY = b"wingshape"
 ROW_GROUP_ROWS = 131_072
 
+ROW_TIMES = ("timestamp0_ns", "timestamp1_ns")
+PIXEL_COVARIANCES = tuple(f"cov_{axes}{camera}_px2" for camera in (0, 1) for axes in ("uu", "uv", "vv"))
+DIRECT_COLUMNS = (*ROW_TIMES, *PIXEL_COVARIANCES)
+"""what only a fit to pixels needs"""
 MARKER_SCHEMA: pa.Schema = pa.schema(
     [
         ("trigger_index", pa.int64()),
@@ -29,6 +33,8 @@ MARKER_SCHEMA: pa.Schema = pa.schema(
         *((f"cov_{axes}_m2", pa.float64()) for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
         *((name, pa.float64()) for name in ("u0_px", "v0_px", "u1_px", "v1_px", "epipolar_px")),
         ("flags", pa.string()),
+        *((name, pa.int64()) for name in ROW_TIMES),
+        *((name, pa.float64()) for name in PIXEL_COVARIANCES),
     ]
 )
 """columns of ``markers.parquet`` (docs/reference/formats.md)"""
@@ -135,6 +141,8 @@ def read_table(
 ) -> pa.Table:
     """The table of ``path`` in the types and order of ``schema``; columns beyond these are left out.
 
+    What only direct mode needs may be missing from the file, and is then missing from what is returned.
+
     With ``truth``, columns that only a measurement has (covariances, pixels, flags) may be missing from the file, and
     are then missing from what is returned.
 
@@ -152,7 +160,7 @@ def read_table(
     for member in schema:
         if member.name in table.column_names:
             wanted.append(member)
-        elif not (truth and member.name.startswith(_TRUTH_MAY_LACK)):
+        elif not (member.name in DIRECT_COLUMNS or (truth and member.name.startswith(_TRUTH_MAY_LACK))):
             raise ProcessError(f"{path}: column {member.name} is missing; {remedy}")
     try:
         return table.select([member.name for member in wanted]).cast(pa.schema(wanted, table.schema.metadata))

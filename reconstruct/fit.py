@@ -3,6 +3,7 @@
 Equation numbers are those of docs/explanation/beam.md. The loads found are net: air, inertia and weight together.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -145,31 +146,29 @@ def marker_problem(half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, se
 
 
 def common_scale(half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, settings: FitSettings) -> Array:
-    """The prior's scale that many instants together make likeliest (eq. 25): (4,).
+    """``scale_of`` sets of markers (F, M, 3) with covariances (F, M, 3, 3)."""
+    sets = zip(marker_xyz_m, marker_cov_m2, strict=True)
+    return scale_of([marker_problem(half, xyz, cov, settings) for xyz, cov in sets], settings)
 
-    Args:
-        half: the half wing.
-        marker_xyz_m: (F, M, 3), of which at most sixty, spread evenly, are used.
-        marker_cov_m2: (F, M, 3, 3).
-        settings: from the wing file.
 
-    All instants share it: what one set's markers tell of how much the wing twists at all is little.
+def scale_of(posed: Sequence[Unscaled], settings: FitSettings) -> Array:
+    """The prior's scale (4,) that many instants together make likeliest (eq. 25).
+
+    At most sixty are used, spread evenly. All instants share it: what one set's markers tell of how much the wing
+    twists at all is little.
     """
-    enough = np.flatnonzero(np.isfinite(marker_xyz_m).all(axis=2).sum(axis=1) >= FEWEST_MARKERS)
+    enough = np.flatnonzero([one.problem.seen.sum() >= FEWEST_MARKERS for one in posed])
     if not len(enough):
         return STATED
-    picked = enough[np.unique(np.linspace(0, len(enough) - 1, _SCALE_SETS).round().astype(int))]
+    picked = [posed[i] for i in enough[np.unique(np.linspace(0, len(enough) - 1, _SCALE_SETS).round().astype(int))]]
+    group = picked[0].group
     scale = STATED
     fits: list[Fit | None] = [None] * len(picked)
     for _ in range(_SCALE_ROUNDS):
-        fits = [
-            fit_frame(half, marker_xyz_m[i], marker_cov_m2[i], settings, start=before, prior_scale=scale)
-            for i, before in zip(picked, fits, strict=True)
-        ]
+        fits = [fit_measured(one, settings, before, scale) for one, before in zip(picked, fits, strict=True)]
         good = [fit for fit in fits if fit is not None and fit.converged]
         if not good:
             break
-        group = _group(half, settings)
         found, told = np.array([fit.unknowns for fit in good]), np.array([fit.told for fit in good])
         before_scale, scale = scale, rescaled(scale, group, found, told, settings.prior_weight)
         if np.abs(np.log(scale / before_scale)).max() < _SAME_SCALE:

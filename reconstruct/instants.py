@@ -27,6 +27,15 @@ class InstantMarkers:
     points: Ints  # (F, M) samples that went into the position: 0 not measured, 1 taken as it is, 5 at best
 
 
+@dataclass(frozen=True)
+class InstantCentroids:
+    """Centroids of F sets brought to their sets' common instants."""
+
+    pixels: Floats  # (F, M, 2, 2) of marker, camera, (u, v); NaN where not seen
+    covariance_px2: Floats  # (F, M, 2, 2, 2)
+    points: Ints  # (F, M, 2) samples, as for markers
+
+
 def at_common_instant(series: MarkerSeries, settings: InstantSettings | None = None) -> InstantMarkers:
     """Interpolate every marker's own track from its row's instant to ``series.frame_timestamp_ns``.
 
@@ -41,24 +50,60 @@ def at_common_instant(series: MarkerSeries, settings: InstantSettings | None = N
     xyz = np.full_like(series.xyz_m, np.nan)
     cov = np.full_like(series.cov_m2, np.nan)
     points = np.zeros(usable.shape, dtype=np.int64)
-    omega = 2 * math.pi * settings.motion_hz
     for marker in range(usable.shape[1]):
         rows = np.flatnonzero(usable[:, marker])
-        if rows.size == 0:
-            continue
-        target = series.frame_timestamp_ns[rows]
-        near, valid = _neighbours(series.timestamp_ns[rows, marker], target, settings.reach_s)
-        since = (series.timestamp_ns[rows, marker][near] - target[:, None]) * 1e-9
-        weights = _lagrange(since, valid)
-        count = valid.sum(axis=1)
-        factorial = np.array([math.factorial(int(n)) for n in range(6)], dtype=np.float64)[count]
-        remainder = np.prod(np.where(valid, np.abs(since), 1.0), axis=1) / factorial
-        remainder *= settings.motion_m * omega**count
-        xyz[rows, marker] = np.einsum("fn,fni->fi", weights, series.xyz_m[rows, marker][near])
-        cov[rows, marker] = np.einsum("fn,fnij->fij", weights**2, series.cov_m2[rows, marker][near])
-        cov[rows, marker] += remainder[:, None, None] ** 2 * np.eye(3)
-        points[rows, marker] = count
+        own = slice(None), marker
+        times = series.timestamp_ns[rows, marker], series.frame_timestamp_ns[rows]
+        known = series.xyz_m[own][rows], series.cov_m2[own][rows]
+        xyz[rows, marker], cov[rows, marker], points[rows, marker] = _moved(*times, *known, settings.motion_m, settings)
     return InstantMarkers(xyz, cov, points)
+
+
+def pixels_at_common_instant(
+    series: MarkerSeries, px_per_m: Floats, settings: InstantSettings | None = None
+) -> InstantCentroids:
+    """``at_common_instant`` of the markers' paths in the images, each camera's by its own rows' instants.
+
+    ``px_per_m`` (M, 2) is by how much a marker's motion shows in each camera at most, for the remainder.
+    """
+    settings = settings or InstantSettings()
+    centroids = series.centroids
+    assert centroids is not None
+    usable = centroids.seen
+    pixels = np.full_like(centroids.pixels, np.nan)
+    covariance = np.full_like(centroids.covariance_px2, np.nan)
+    points = np.zeros(usable.shape, dtype=np.int64)
+    for marker, camera in np.ndindex(*usable.shape[1:]):
+        rows = np.flatnonzero(usable[:, marker, camera])
+        at = rows, marker, camera
+        moved = _moved(
+            centroids.timestamp_ns[at],
+            series.frame_timestamp_ns[rows],
+            centroids.pixels[at],
+            centroids.covariance_px2[at],
+            settings.motion_m * float(px_per_m[marker, camera]),
+            settings,
+        )
+        pixels[at], covariance[at], points[at] = moved
+    return InstantCentroids(pixels, covariance, points)
+
+
+def _moved(
+    time_ns: Ints, target_ns: Ints, values: Floats, covariance: Floats, motion: float, settings: InstantSettings
+) -> tuple[Floats, Floats, Ints]:
+    """A path's samples (n, d) at their own times brought to ``target_ns``, covariances (n, d, d), samples used (n,)."""
+    if not len(time_ns):
+        return values, covariance, np.empty(0, np.int64)
+    near, valid = _neighbours(time_ns, target_ns, settings.reach_s)
+    since = np.asarray((time_ns[near] - target_ns[:, None]) * 1e-9, dtype=np.float64)
+    weights = _lagrange(since, valid)
+    count = valid.sum(axis=1)
+    omega = 2 * math.pi * settings.motion_hz
+    factorial = np.array([math.factorial(int(n)) for n in range(6)], dtype=np.float64)[count]
+    remainder = np.prod(np.where(valid, np.abs(since), 1.0), axis=1) / factorial * motion * omega**count
+    moved = np.einsum("fn,fni->fi", weights, values[near])
+    spread = np.einsum("fn,fnij->fij", weights**2, covariance[near])
+    return moved, spread + remainder[:, None, None] ** 2 * np.eye(values.shape[1]), count
 
 
 def _neighbours(time_ns: Ints, target_ns: Ints, reach_s: float) -> tuple[npt.NDArray[np.intp], Bools]:

@@ -23,6 +23,7 @@ def fit_pixels(
     settings: FitSettings,
     start: Fit | None = None,
     prior_scale: Array | None = None,
+    epipolar_px: float = 0.0,
 ) -> Fit:
     """Fit loads and shape to centroids in both cameras (eq. 27).
 
@@ -34,19 +35,29 @@ def fit_pixels(
         settings: from the wing file; ``marker_model_sigma_m`` is taken to pixels by the cameras.
         start: the fit of a neighbouring instant.
         prior_scale: (4,) as in ``fit_frame``.
+        epipolar_px: one sigma of what calibration adds to the distance from the epipolar condition.
 
     Returns:
         the fit, ``distance`` in sigmas of all that was seen of a marker; ``residual_m`` is NaN, nothing was measured
         in metres. NaN and a reason as in ``fit_frame``; a marker counts when one camera saw it.
     """
-    posed = pixel_problem(half, rig, pixels, covariance_px2, settings)
+    posed = pixel_problem(half, rig, pixels, covariance_px2, settings, epipolar_px)
     return fit_measured(posed, settings, start, prior_scale)
 
 
 def pixel_problem(
-    half: HalfWing, rig: RigSide, pixels: Array, covariance_px2: Array, settings: FitSettings
+    half: HalfWing,
+    rig: RigSide,
+    pixels: Array,
+    covariance_px2: Array,
+    settings: FitSettings,
+    epipolar_px: float = 0.0,
 ) -> Unscaled:
-    """The problem of centroids (M, 2, 2) with covariances (M, 2, 2, 2); raises ValueError for other shapes."""
+    """The problem of centroids (M, 2, 2) with covariances (M, 2, 2, 2); raises ValueError for other shapes.
+
+    Calibration makes the cameras disagree on lights by more than centroids' noise. No place of a light explains that,
+    so ``epipolar_px`` widens what is across (both saw it), or half of its variance any direction (one did).
+    """
     markers = len(half.marker_ids)
     if pixels.shape != (markers, _CAMERAS, 2) or covariance_px2.shape != (markers, _CAMERAS, 2, 2):
         raise ValueError(f"expected {markers} markers in 2 cameras, got {pixels.shape} and {covariance_px2.shape}")
@@ -57,6 +68,8 @@ def pixel_problem(
     safe = np.where(seen[:, :, None, None], safe, np.eye(2))
     given = np.where(seen[:, :, None], pixels, 0.0)
     body_to_camera = _cameras_from_body(rig)
+    both = seen.all(axis=1)
+    safe = safe + np.where(both, 0.0, epipolar_px**2 / 2)[:, None, None, None] * np.eye(2)
 
     def measure(point: Array) -> tuple[Array, Array]:
         """In sigmas: (M, 4) and (M, 4, 3). Where a light cannot be (behind a camera), it has no pull for this step."""
@@ -70,11 +83,32 @@ def pixel_problem(
         spread = settings.marker_model_sigma_m**2 * slopes @ slopes.transpose(0, 2, 1)
         for at in range(_CAMERAS):
             spread[:, 2 * at : 2 * at + 2, 2 * at : 2 * at + 2] += safe[:, at]
+        spread[both] += epipolar_px**2 * _across(slopes[both])
         whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(spread)), dtype=np.float64)
         return (whiten @ error[:, :, None])[:, :, 0], whiten @ slopes
 
     numbers: Array = 2.0 * seen.sum(axis=1)
     return pose(half, settings, measure, numbers > 0, numbers)
+
+
+def px_per_m(half: HalfWing, rig: RigSide) -> Array:
+    """(M, 2) by how many pixels a marker of the unloaded wing moves at most in each camera, a metre; 0 out of view."""
+    place = half.rest_marker_m
+    found: Array = np.zeros((len(place), _CAMERAS))
+    for at, (camera, T) in enumerate(zip((rig.pair.cam0, rig.pair.cam1), _cameras_from_body(rig), strict=True)):
+        slope = camera.project_with_jacobian(place @ T[:3, :3].T + T[:3, 3])[1]
+        visible = np.isfinite(slope).all(axis=(1, 2))
+        found[visible, at] = np.linalg.norm(slope[visible], ord=2, axis=(1, 2))
+    return found
+
+
+def _across(slopes: Array) -> Array:
+    """(n, 4, 4) what of both cameras' pixels no motion of a light, by ``slopes`` (n, 4, 3), can make."""
+    normal = slopes.transpose(0, 2, 1) @ slopes
+    regular = np.linalg.det(normal) > 0
+    normal = np.where(regular[:, None, None], normal, np.eye(3))
+    made = slopes @ np.linalg.solve(normal, slopes.transpose(0, 2, 1))
+    return np.asarray(np.where(regular[:, None, None], np.eye(4) - made, 0.0))
 
 
 def _cameras_from_body(rig: RigSide) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -20,8 +20,7 @@ from process.memory import MemoryWatch
 from process.parts import PartStore
 from process.pipeline import PipelineSettings
 from process.recording import Recording, find_files, open_recording
-from process.reference import Window
-from process.shared_error import with_rig
+from process.shared_error import layout_of, sides_of, with_rig
 from process.signal_table import MAX_GAP_S
 from process.tables import MARKER_SCHEMA, TableWriter, write_table
 from process.workers import Crew, crew, usable_cores
@@ -29,23 +28,21 @@ from reconstruct.air_table import AIR, SpecificForce, air_table
 from reconstruct.assemble import Target, assemble
 from reconstruct.beside import Beside, beside_flight, beside_markers
 from reconstruct.compare import Comparison, compare
-from reconstruct.dense import MAT, NETCDF, write_mat, write_netcdf
 from reconstruct.hang import DOUBTFUL_SIGMAS, recorded_hangs
 from reconstruct.identify import identify
 from reconstruct.iteration import FEWEST_MARKERS
+from reconstruct.observed import measured_markers
 from reconstruct.reference import Reference
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_result
-from reconstruct.scene import SCENE, write_scene
-from reconstruct.series import half_of, measured_markers
+from reconstruct.series import half_of
 from reconstruct.shared import SharedError, shared_errors
-from reconstruct.stages import FitPlan, Key, fit, measure, sampled, take
+from reconstruct.stages import Cameras, FitPlan, Key, fit, measure, sampled, take
 from reconstruct.summary import holes, summarise
 from reconstruct.tables import FRAMES, LOADS, MARKERS, RESIDUALS, SHAPE, SIDES, MarkerSeries, read_table
 from reconstruct.wing import Wing, read_wing
 
 PARTS = ".parts"
-FORMATS = ("mat", "mcap", "netcdf")
 MODULES = ("reconstruct.stages",)  # what a worker loads before the clock starts
 BYTES_A_SECOND = 500e6  # of frames that one core works off, roughly,
 ROWS_A_SECOND = 6000.0  # and of markers
@@ -79,12 +76,12 @@ class Job:
     command: str = ""  # as it is recorded in the files
     smooth_s: float = 0.0  # correlation time of smoothing; 0: every set by itself
     reference: Reference = None  # what displacements are counted from; None: the unloaded wing
-    also: tuple[str, ...] = ("mat", "mcap")  # of FORMATS
     report: bool = True
     scheduler: str | None = None  # a Dask scheduler's address, or local; None: processes of our own
     settings: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
     dbc: tuple[Path, ...] = ()  # what the recorded CAN frames mean
     max_gap_s: float = MAX_GAP_S  # that signals are interpolated over
+    direct: bool = False  # fit both cameras' pixels, not triangulated places
     specific_force: SpecificForce | None = None  # signals that tell the aircraft's acceleration; None: net loads only
 
 
@@ -109,7 +106,7 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
     clock = _Clock(time.monotonic())
     wing = read_wing(job.wing)
     source = _Source(job)
-    plan = FitPlan(wing, job.smooth_s, source.shared, job.reference)
+    plan = FitPlan(wing, job.smooth_s, source.shared, job.reference, cameras=source.cameras() if job.direct else None)
     plan.of(SIDES[0])  # what cannot be fitted is refused before frames are measured
     with MemoryWatch() as memory, crew(_workers(job, source), job.scheduler, MODULES) as hands:
         clock.first_byte = time.monotonic()
@@ -143,6 +140,7 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
         **summarise(found.tallies, found.frames),
         "reference": found.wings.column("reference")[0].as_py(),
         "at_rest": {one.side: one.as_dict() for one in hangs},
+        "direct": job.direct,
         "smoothed_s": job.smooth_s,
         "warnings": [
             *_warnings(wing, sampled(fitted, wing, store, source.name)),
@@ -159,7 +157,6 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
     if not summary["converged_percent"]:
         reason = found.frames.column("reason")[0].as_py()
         raise ReconstructError(f"{source.name}: no set could be fitted ({reason}); see {job.out / FRAMES}")
-    _write_also(job, store, fitted, note)
     if job.report:
         write_report(read_result(job.out), job.out)
         end = time.monotonic()
@@ -170,14 +167,12 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
     return summary, problems
 
 
-def run_comparison(
-    result: Path, reference: Path, folder: Path, command: str, *, from_start: bool = False, window: Window | None = None
-) -> Comparison:
+def run_comparison(result: Path, reference: Path, folder: Path, command: str) -> Comparison:
     """Compare, write comparison.json and the tables of errors into ``folder``, and the report with them.
 
     Raises UsageError when a folder or table is missing or cannot be used, or nothing of the two overlaps.
     """
-    comparison = compare(result, reference, from_start=from_start, window=window)
+    comparison = compare(result, reference)
     folder.mkdir(parents=True, exist_ok=True)
     write_table(comparison.shape_errors, folder / SHAPE_ERRORS, command=command)
     write_table(comparison.marker_errors, folder / MARKER_ERRORS, command=command)
@@ -213,6 +208,16 @@ class _Source:
         self.name = " ".join(str(path) for path in job.flights)
         self.work_s = sum(path.stat().st_size for path in find_files(job.flights)) / BYTES_A_SECOND
 
+    def cameras(self) -> Cameras:
+        """Whose pixels there are. Raises UsageError when the marker table does not say."""
+        if self.rig is not None:
+            return Cameras({side: self.rig.side(side) for side in SIDES}, self.rig.markers)
+        assert self._table is not None
+        sides, layout = sides_of(self._table), layout_of(self._table)
+        if layout is None:
+            raise UsageError(f"{self.name}: does not say which cameras saw the markers; leave --direct out")
+        return Cameras(sides, layout)
+
     def open(self) -> None:
         """Index the recording."""
         if self._table is None:
@@ -230,6 +235,7 @@ class _Source:
         config = {
             "measuring": dataclasses.asdict(job.settings),
             "instants": dataclasses.asdict(plan.instants),
+            "direct": plan.cameras is not None,
             "smooth_s": plan.smooth_s,
             "reference": None if plan.reference is None else str(plan.reference),
         }
@@ -244,15 +250,6 @@ class _Source:
         return measure(self._recording, self.rig, self._job.settings, store, hands, tell)
 
 
-def _write_also(job: Job, store: PartStore, fitted: Sequence[Key], note: Mapping[str, Any]) -> None:
-    if "mcap" in job.also:
-        write_scene(store, fitted, job.out, note)
-    if "mat" in job.also:
-        write_mat(job.out)
-    if "netcdf" in job.also:
-        write_netcdf(job.out)
-
-
 def _workers(job: Job, source: _Source) -> int:
     return job.workers or max(1, min(usable_cores(), int(source.work_s / WORTH_A_WORKER_S)))
 
@@ -264,7 +261,7 @@ def _telling(progress: Progress, stage: str, flight_s: float) -> Callable[[int, 
 def _remove_stale(job: Job) -> None:
     """A run that fails half way must not leave an older one's words."""
     texts = [Path(name).with_suffix(".csv").name for name in (SHAPE, FRAMES, LOADS, RESIDUALS, MARKERS, AIR)]
-    for stale in (AIR, REPORT, SCENE, MAT, NETCDF, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
+    for stale in (AIR, REPORT, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
         (job.out / stale).unlink(missing_ok=True)
 
 
@@ -278,7 +275,7 @@ def _warnings(wing: Wing, sample: Mapping[str, MarkerSeries]) -> list[str]:
     """What the wing's markers, with the noise they had, cannot tell."""
     said: dict[str, None] = {}
     for side, series in sample.items():
-        known = measured_markers(series)
+        known = measured_markers(series)  # of a sample without pixels: by both cameras
         cov = np.full(series.cov_m2.shape[1:], np.nan)
         for marker in range(known.shape[1]):
             if known[:, marker].any():

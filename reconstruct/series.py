@@ -9,16 +9,27 @@ from typing import Any
 import numpy as np
 
 from capture.errors import UsageError
+from process.camera_model import RigSide
 from process.pipeline import BLOCK_TRIGGERS
 from process.reference import Window
 from process.workers import Shared, crew, usable_cores
-from reconstruct.fit import Fit, common_scale, fit_frame
-from reconstruct.instants import InstantSettings, at_common_instant
-from reconstruct.iteration import FEWEST_MARKERS
+from reconstruct.fit import Fit, Unscaled, fit_measured, scale_of, with_residuals
+from reconstruct.instants import InstantSettings
+from reconstruct.observed import Observed, enough_markers, measured_markers, observe
 from reconstruct.reference import Reference, ReferenceShape, mean_of, recorded, unloaded
 from reconstruct.shared import SharedError, shared_errors, sigma_of
 from reconstruct.smooth import smooth_fits
-from reconstruct.tables import SHAPE, Bools, Floats, Ints, MarkerSeries, Words, marker_series, read_table
+from reconstruct.tables import (
+    SHAPE,
+    Bools,
+    Centroids,
+    Floats,
+    Ints,
+    MarkerSeries,
+    Words,
+    marker_series,
+    read_table,
+)
 from reconstruct.wing import HalfWing, Wing
 from reconstruct.wing_file import FitSettings
 
@@ -99,6 +110,8 @@ class FitHow:
     """of the prior's groups; None: each set chooses its own"""
     reference: ReferenceShape | None = None
     """what displacements are counted from; None: the unloaded wing"""
+    rig: RigSide | None = None
+    """cameras whose pixels are fitted; None: markers' places are"""
 
     @property
     def around_s(self) -> float:
@@ -159,8 +172,7 @@ def fit_series(
         how = fit_how(wing, side, given, smooth_s, (shared or {}).get(side))
         picked = np.flatnonzero(enough_markers(series))
         picked = picked[picks(picked.size)]
-        moved = at_common_instant(series, how.instants)
-        how = replace(how, prior_scale=prior_scale(how, moved.xyz_m[picked], moved.cov_m2[picked]))
+        how = replace(how, prior_scale=prior_scale(how, observe(series, how.half, how.rig, how.instants)[picked]))
         cut = stretches(series, how.around_s)
         alone = Shared(how)
         window = window_ns(reference, start_ns)
@@ -179,7 +191,14 @@ def fit_series(
     return {side: joined([part for part in parts if part.side == side]) for side in markers}
 
 
-def fit_how(wing: Wing, side: str, instants: InstantSettings, smooth_s: float, shared: SharedError | None) -> FitHow:
+def fit_how(
+    wing: Wing,
+    side: str,
+    instants: InstantSettings,
+    smooth_s: float,
+    shared: SharedError | None,
+    rig: RigSide | None = None,
+) -> FitHow:
     """How the sets of one side are fitted, but for the prior's scale and the reference.
 
     Raises UsageError when the wing file does not say where loads act, or smoothing asks for loads elsewhere.
@@ -188,7 +207,7 @@ def fit_how(wing: Wing, side: str, instants: InstantSettings, smooth_s: float, s
         raise UsageError(f"the wing {wing.name!r} has no [fit] section: say where its loads act (load_stations_m)")
     if smooth_s > 0 and wing.fit.loads != "everywhere":
         raise UsageError('smoothing in time needs loads = "everywhere" in the wing file\'s [fit]')
-    return FitHow(half_of(wing, side), wing.fit, instants, smooth_s, shared)
+    return FitHow(half_of(wing, side), wing.fit, instants, smooth_s, shared, rig=rig)
 
 
 def stretches(series: MarkerSeries, around_s: float) -> list[Stretch]:
@@ -254,26 +273,16 @@ def reference_shape(how: FitHow, side: str, reference: Reference, in_window: Ite
     return found
 
 
-def prior_scale(how: FitHow, xyz_m: Floats, cov_m2: Floats) -> Floats | None:
+def prior_scale(how: FitHow, observed: Observed) -> Floats | None:
     """The prior's scale that these sets (``picks``) make likeliest; None where each set is to choose its own."""
     if how.smooth_s == 0 and how.settings.prior_weight != "data":
         return None
-    return common_scale(how.half, xyz_m, cov_m2, how.settings)
+    return scale_of(observed.problems(how.half, how.settings, how.rig), how.settings)
 
 
 def picks(count: int) -> Ints:
     """Which of ``count`` sets with enough markers the prior's scale is chosen from: SCALE_SETS, spread evenly."""
     return np.unique(np.linspace(0, count - 1, SCALE_SETS).round().astype(np.int64)) if count else np.empty(0, np.int64)
-
-
-def measured_markers(series: MarkerSeries) -> Bools:
-    """(F, M) whether a marker was measured, with a covariance."""
-    return np.asarray(series.seen & np.isfinite(series.cov_m2).all(axis=(-1, -2)))
-
-
-def enough_markers(series: MarkerSeries) -> Bools:
-    """(F,) whether enough markers were measured to fit a set."""
-    return np.asarray(measured_markers(series).sum(axis=1) >= FEWEST_MARKERS)
 
 
 def half_of(wing: Wing, side: str) -> HalfWing:
@@ -307,22 +316,39 @@ def as_in(half: HalfWing, series: MarkerSeries) -> MarkerSeries:
     flags = np.full((sets, markers), "not_seen", dtype=object)
     time[:, to], xyz[:, to], cov[:, to], flags[:, to] = series.timestamp_ns, series.xyz_m, series.cov_m2, series.flags
     marker = np.asarray(half.marker_ids, dtype=np.int64)
-    return replace(series, marker=marker, timestamp_ns=time, xyz_m=xyz, cov_m2=cov, flags=flags)
+    centroids = None if series.centroids is None else _centroids_in(series.centroids, to, time)
+    return replace(series, marker=marker, timestamp_ns=time, xyz_m=xyz, cov_m2=cov, flags=flags, centroids=centroids)
+
+
+def _centroids_in(centroids: Centroids, to: Ints, time_ns: Ints) -> Centroids:
+    """``centroids`` at the columns ``to`` of as many markers as ``time_ns`` (F, M) has, which is theirs if not seen."""
+    pixels, spread = np.full((*time_ns.shape, 2, 2), np.nan), np.full((*time_ns.shape, 2, 2, 2), np.nan)
+    own, epipolar = np.repeat(time_ns[:, :, None], 2, axis=2), np.full(time_ns.shape, np.nan)
+    pixels[:, to], spread[:, to] = centroids.pixels, centroids.covariance_px2
+    own[:, to], epipolar[:, to] = centroids.timestamp_ns, centroids.epipolar_px
+    return Centroids(pixels, spread, own, epipolar)
 
 
 def _fits(how: FitHow, stretch: Stretch) -> tuple[Ints, Iterable[Fit]]:
     """(F, M) samples that the markers of the stretch's own sets are made of, and their fits."""
     series, own = stretch.markers, slice(stretch.first, stretch.last)
-    moved = at_common_instant(series, how.instants)
-    points = moved.points[own]
+    observed = observe(series, how.half, how.rig, how.instants)
     if how.smooth_s == 0:
-        return points, fits_in_turn(how.half, how.settings, moved.xyz_m[own], moved.cov_m2[own], how.prior_scale)
+        observed = observed[own]
+        fits = fits_in_turn(observed.problems(how.half, how.settings, how.rig), how.settings, how.prior_scale)
+    else:
+        fits = iter(_smoothed(how, series, observed)[own])
+        observed = observed[own]
+    return observed.points, (with_residuals(how.half, *one) for one in zip(fits, observed.xyz_m, strict=True))
+
+
+def _smoothed(how: FitHow, series: MarkerSeries, observed: Observed) -> list[Fit]:
     time_s = (series.frame_timestamp_ns - series.frame_timestamp_ns[0]) * 1e-9
     if np.any(np.diff(time_s) <= 0):
         raise UsageError(f"{series.side} wing: times of the sets do not grow; smoothing in time needs that they do")
     assert how.prior_scale is not None
-    fits = smooth_fits(how.half, how.settings, moved.xyz_m, moved.cov_m2, time_s, how.prior_scale, how.smooth_s)
-    return points, fits[own]
+    problems = observed.problems(how.half, how.settings, how.rig)
+    return smooth_fits(problems, how.settings, time_s, how.prior_scale, how.smooth_s)
 
 
 def _from_file(how: FitHow, side: str, path: Path) -> ReferenceShape:
@@ -332,8 +358,8 @@ def _from_file(how: FitHow, side: str, path: Path) -> ReferenceShape:
     series = marker_series(table, str(path)).get(side)
     if series is None:
         raise UsageError(f"{path}: has no {side} wing; give a reference with every wing of this recording")
-    moved = at_common_instant(as_in(how.half, series))
-    fits = list(fits_in_turn(how.half, how.settings, moved.xyz_m, moved.cov_m2, how.prior_scale))
+    places = observe(as_in(how.half, series), how.half, None, InstantSettings())
+    fits = list(fits_in_turn(places.problems(how.half, how.settings, None), how.settings, how.prior_scale))
     shared = shared_errors(table).get(side)
     same = shared is not None and how.shared is not None and shared.as_in(how.shared)
     found = mean_of(str(path), how.half, fits, shared, same=same)
@@ -342,16 +368,14 @@ def _from_file(how: FitHow, side: str, path: Path) -> ReferenceShape:
     return found
 
 
-def fits_in_turn(
-    half: HalfWing, settings: FitSettings, xyz_m: Floats, cov_m2: Floats, prior_scale: Floats | None = None
-) -> Iterator[Fit]:
-    """Fit consecutive sets (F, M, 3), each from the last one's fit (one that did not converge starts nothing).
+def fits_in_turn(posed: Iterable[Unscaled], settings: FitSettings, prior_scale: Floats | None) -> Iterator[Fit]:
+    """Fit consecutive sets, each from the last one's fit (one that did not converge starts nothing).
 
     The prior's scale is that given, or each set chooses its own.
     """
     fit: Fit | None = None
-    for xyz, cov in zip(xyz_m, cov_m2, strict=True):
-        fit = fit_frame(half, xyz, cov, settings, start=fit, prior_scale=prior_scale)
+    for one in posed:
+        fit = fit_measured(one, settings, fit, prior_scale)
         yield fit
 
 

@@ -5,14 +5,13 @@ without enough markers are bridged, with bands as wide as the neighbours allow. 
 docs/explanation/beam.md.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
 
-from reconstruct.fit import Fit, Unscaled, fit_frame, fit_from, marker_problem, scaled, with_residuals
+from reconstruct.fit import Fit, Unscaled, fit_from, fit_measured, scaled
 from reconstruct.iteration import linearise
 from reconstruct.rotation import Array, Mask
-from reconstruct.wing import HalfWing
 from reconstruct.wing_file import FitSettings
 
 _TOLD = 1e-3  # an unknown's direction of which no set tells more is left to the prior
@@ -20,40 +19,32 @@ _FARTHEST = 3.0  # correlation times: what lies farther from the next fitted set
 
 
 def smooth_fits(
-    half: HalfWing,
+    posed: Sequence[Unscaled],
     settings: FitSettings,
-    marker_xyz_m: Array,
-    marker_cov_m2: Array,
     time_s: Array,
     prior_scale: Array,
     correlation_s: float,
-    progress: Callable[[int], None] = lambda _: None,
 ) -> list[Fit]:
     """Fit F sets by themselves, then smooth what they tell (Rauch, Tung & Striebel 1965; eqs. 28 and 29).
 
     Args:
-        half: the half wing.
+        posed: what each set, at its common instant, is to explain.
         settings: from the wing file; loads must act everywhere.
-        marker_xyz_m: (F, M, 3) at the sets' common instants, NaN where not measured.
-        marker_cov_m2: (F, M, 3, 3).
         time_s: (F,) ascending.
         prior_scale: (4,) one for all.
         correlation_s: over which the wing's motion is alike.
-        progress: told the number of sets fitted since last.
 
     Returns:
-        F fits. One whose set could not be fitted has no marker in use; it is not bridged, but NaN with its own reason,
-        where no fitted set lies within three correlation times on both sides.
+        F fits; ``residual_m`` is left to the caller. One whose set could not be fitted has no marker in use; it is not
+        bridged, but NaN with its own reason, where no fitted set lies within three correlation times on both sides.
     """
     if settings.loads != "everywhere":
         raise ValueError('smoothing needs loads = "everywhere"')
-    single, posed = [], []
+    single = []
     before: Fit | None = None
-    for xyz, cov in zip(marker_xyz_m, marker_cov_m2, strict=True):
-        before = fit_frame(half, xyz, cov, settings, start=before, prior_scale=prior_scale)
+    for one in posed:
+        before = fit_measured(one, settings, before, prior_scale)
         single.append(before)
-        posed.append(marker_problem(half, xyz, cov, settings))
-        progress(1)
     good: Mask = np.array([fit.converged for fit in single], dtype=bool)
     if good.sum() < 2:
         return single
@@ -71,8 +62,7 @@ def smooth_fits(
         if not near[i]:
             out.append(fit)
             continue
-        smoothed = fit_from(one, settings, fit, kept @ mean[i], kept @ spread[i] @ kept.T + left, prior_scale)
-        out.append(with_residuals(half, smoothed, marker_xyz_m[i]))
+        out.append(fit_from(one, settings, fit, kept @ mean[i], kept @ spread[i] @ kept.T + left, prior_scale))
     return out
 
 

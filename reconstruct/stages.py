@@ -9,13 +9,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from capture.errors import UsageError
-from process.camera_model import Rig
+from process.camera_model import MarkerLayout, Rig, RigSide
 from process.parts import Part, PartStore
 from process.pipeline import BLOCK_TRIGGERS, BlockJob, PipelineSettings, blocks, measure_block
 from process.recording import Recording
 from process.workers import Crew, Shared
 from reconstruct.fit import Fit
-from reconstruct.instants import InstantSettings, at_common_instant
+from reconstruct.instants import InstantSettings
+from reconstruct.observed import Observed, enough_markers, measured_markers, observe, with_centroids
 from reconstruct.reference import Reference
 from reconstruct.result_tables import part_tables
 from reconstruct.series import (
@@ -24,11 +25,9 @@ from reconstruct.series import (
     FitJob,
     Stretch,
     as_in,
-    enough_markers,
     fit_how,
     fit_stretch,
     half_of,
-    measured_markers,
     picks,
     prior_scale,
     reference_shape,
@@ -67,6 +66,14 @@ class Key:
 
 
 @dataclass(frozen=True, eq=False)
+class Cameras:
+    """What fits to pixels need to know of those who took them."""
+
+    sides: Mapping[str, RigSide]
+    layout: MarkerLayout
+
+
+@dataclass(frozen=True, eq=False)
 class FitPlan:
     """How a flight is fitted."""
 
@@ -75,17 +82,18 @@ class FitPlan:
     shared: Mapping[str, SharedError]  # by side
     reference: Reference
     instants: InstantSettings = field(default_factory=InstantSettings)
+    cameras: Cameras | None = None  # whose pixels are fitted; None: markers' places are
 
     def of(self, side: str) -> FitHow:
         """How its sets of one side are fitted, but for the prior's scale and the reference."""
-        return fit_how(self.wing, side, self.instants, self.smooth_s, self.shared.get(side))
+        rig = None if self.cameras is None else self.cameras.sides.get(side)
+        return fit_how(self.wing, side, self.instants, self.smooth_s, self.shared.get(side), rig)
 
 
 @dataclass(frozen=True, eq=False)
 class _ScaleJob:
     how: Shared[FitHow]
-    xyz_m: Floats
-    cov_m2: Floats
+    observed: Observed
 
 
 def measure(
@@ -194,7 +202,7 @@ class _Markers:
         self._around_s = plan.of("left").around_s
         self._plan = plan
         self._enough: dict[Key, NDArray[np.intp]] = {}
-        self._series = lru_cache(maxsize=CACHED_BLOCKS)(lambda key: _series(key, plan.wing, store, name))
+        self._series = lru_cache(maxsize=CACHED_BLOCKS)(lambda key: _series(key, plan.wing, store, name, plan.cameras))
         anything = False
         starts_ns = []
         for key in keys:
@@ -237,17 +245,14 @@ class _Markers:
         order = self._order[side]
         ends = np.cumsum([self._enough[key].size for key in order])
         picked = picks(int(ends[-1]))
-        xyz = [np.empty((0, how.half.marker_ids.size, 3))]
-        cov = [np.empty((0, how.half.marker_ids.size, 3, 3))]
+        some: list[Observed] = []
         for key, end in zip(order, ends.tolist(), strict=True):
             begin = end - self._enough[key].size
             rows = self._enough[key][picked[(picked >= begin) & (picked < end)] - begin]
-            if rows.size:
+            if rows.size or not some:
                 stretch = self.stretch(key)
-                moved = at_common_instant(stretch.markers, how.instants)
-                xyz.append(moved.xyz_m[stretch.first + rows])
-                cov.append(moved.cov_m2[stretch.first + rows])
-        return _ScaleJob(Shared(how), np.concatenate(xyz), np.concatenate(cov))
+                some.append(observe(stretch.markers, how.half, how.rig, how.instants)[stretch.first + rows])
+        return _ScaleJob(Shared(how), Observed.join(some))
 
     def _own(self, key: Key) -> MarkerSeries:
         series = self._series(key)
@@ -255,16 +260,21 @@ class _Markers:
         return series
 
 
-def _series(key: Key, wing: Wing, store: PartStore, name: str) -> MarkerSeries | None:
-    """A measured block; None when none of its frames could be read."""
+def _series(key: Key, wing: Wing, store: PartStore, name: str, cameras: Cameras | None = None) -> MarkerSeries | None:
+    """A measured block, with pixels if ``cameras`` are given; None when none of its frames could be read."""
     table = store.read(key.markers).tables[MARKERS]
     if not table.num_rows:
         return None
-    return as_in(half_of(wing, key.side), marker_series(table, name)[key.side])
+    series = marker_series(table, name)[key.side]
+    if cameras is not None:
+        if key.side not in cameras.sides:
+            raise UsageError(f"{name}: does not say which cameras saw the {key.side} wing; leave --direct out")
+        series = with_centroids(series, table, cameras.sides[key.side], cameras.layout, name)
+    return as_in(half_of(wing, key.side), series)
 
 
 def _scale(job: _ScaleJob) -> Floats | None:
-    return prior_scale(job.how.get(), job.xyz_m, job.cov_m2)
+    return prior_scale(job.how.get(), job.observed)
 
 
 def _fit(job: FitJob) -> Part:

@@ -1,7 +1,7 @@
 """Tables of a result folder: Parquet (and CSV) on disk ⇄ dense arrays, one set of arrays a side."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import pyarrow.parquet
 
 from capture.errors import UsageError
 from capture.record import PtpState
+from process.tables import DIRECT_COLUMNS, PIXEL_COVARIANCES, ROW_TIMES
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -29,6 +30,7 @@ UNLOADED = "unloaded.parquet"
 
 POSITION = ("x_m", "y_m", "z_m")
 COVARIANCE = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
+PIXELS = ("u0_px", "v0_px", "u1_px", "v1_px")
 SIGMA = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 MOVED = ("dx_m", "dy_m", "dz_m")
 TIP_COLUMNS = ("tip_dx_m", "tip_dy_m", "tip_dz_m", "tip_twist_deg")
@@ -46,6 +48,30 @@ _PER_SET = (  # of MarkerSeries
 _TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
+@dataclass(frozen=True, eq=False)
+class Centroids:
+    """Both cameras' pixels of F sets and M markers; NaN where a camera did not see one."""
+
+    pixels: Floats  # (F, M, 2, 2) of marker, camera, (u, v)
+    covariance_px2: Floats  # (F, M, 2, 2, 2)
+    timestamp_ns: Ints  # (F, M, 2) each one's own instant
+    epipolar_px: Floats  # (F, M) signed distance from the epipolar condition; NaN where not seen by both
+
+    @property
+    def seen(self) -> Bools:
+        """(F, M, 2) whether a camera saw a marker."""
+        return np.asarray(np.isfinite(self.pixels).all(axis=-1) & np.isfinite(self.covariance_px2).all(axis=(-1, -2)))
+
+    def __getitem__(self, rows: slice) -> "Centroids":
+        """Some of the sets."""
+        return Centroids(*(getattr(self, member.name)[rows] for member in fields(self)))
+
+    @classmethod
+    def join(cls, parts: Sequence["Centroids"]) -> "Centroids":
+        """The sets of all ``parts``, at least one, which have the same markers."""
+        return cls(*(np.concatenate([getattr(one, member.name) for one in parts]) for member in fields(cls)))
+
+
 @dataclass(frozen=True)
 class MarkerSeries:
     """One side's markers, dense over F sets and M markers; what was not measured is NaN."""
@@ -60,6 +86,7 @@ class MarkerSeries:
     flags: Words  # (F, M) str, empty when good
     time_sigma_ns: Floats  # (F,) one sigma of the common instant; NaN: not known
     ptp_state: Words  # (F,) str, of the recorder's PTP port; UNKNOWN where the table does not say
+    centroids: Centroids | None = None  # for direct mode
 
     @property
     def seen(self) -> Bools:
@@ -68,13 +95,15 @@ class MarkerSeries:
 
     def __getitem__(self, rows: slice) -> "MarkerSeries":
         """Some of the sets."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in _PER_SET})
+        centroids = None if self.centroids is None else self.centroids[rows]
+        return replace(self, centroids=centroids, **{name: getattr(self, name)[rows] for name in _PER_SET})
 
     @classmethod
     def join(cls, parts: Sequence["MarkerSeries"]) -> "MarkerSeries":
         """The sets of all ``parts``, at least one, which have the same markers."""
         whole: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _PER_SET}
-        return replace(parts[0], **whole)
+        centroids = [one.centroids for one in parts if one.centroids is not None]
+        return replace(parts[0], centroids=Centroids.join(centroids) if centroids else None, **whole)
 
 
 @dataclass(frozen=True)
@@ -140,6 +169,37 @@ def marker_series(table: pa.Table, name: str) -> dict[str, MarkerSeries]:
         own = {key: values[pick] for key, values in rows.items()}
         series[side] = _dense_markers(side, triggers, frame_of, own, name)
     return series
+
+
+def centroid_series(table: pa.Table, series: MarkerSeries, name: str) -> Centroids:
+    """The pixels of ``series``, which is a side of the marker table.
+
+    Those that one camera saw and that may be something else (``ambiguous``) are left out. Raises UsageError when the
+    table does not have the columns.
+    """
+    columns = (*DIRECT_COLUMNS, *PIXELS, "epipolar_px")
+    missing = [column for column in columns if column not in table.column_names]
+    if missing:
+        raise UsageError(
+            f"{name}: has no {missing[0]}, which a fit to pixels needs; make the table again with `wingproc markers`, "
+            "or leave --direct out"
+        )
+    pick = np.flatnonzero(_words(table, "side") == series.side)
+    frame_of = np.searchsorted(series.trigger_index, _ints(table, "trigger_index", name)[pick])
+    marker_of = np.searchsorted(series.marker, _ints(table, "marker", name)[pick])
+    shape = (series.trigger_index.size, series.marker.size)
+    pixels, spread = np.full((*shape, 2, 2), np.nan), np.full((*shape, 2, 2, 2), np.nan)
+    time = np.repeat(series.frame_timestamp_ns, shape[1] * 2).reshape(*shape, 2)
+    epipolar = np.full(shape, np.nan)
+    pixels[frame_of, marker_of] = _stack(table, PIXELS, name)[pick].reshape(-1, 2, 2)
+    uu, uv, vv = np.moveaxis(_stack(table, PIXEL_COVARIANCES, name)[pick].reshape(-1, 2, 3), 2, 0)
+    spread[frame_of, marker_of] = np.stack([uu, uv, uv, vv], axis=-1).reshape(-1, 2, 2, 2)
+    for camera, column in enumerate(ROW_TIMES):
+        time[frame_of, marker_of, camera] = _ints(table, column, name)[pick]
+    epipolar[frame_of, marker_of] = _stack(table, ("epipolar_px",), name)[pick, 0]
+    doubtful = [("one_camera" in flags and "ambiguous" in flags) for flags in series.flags.ravel()]
+    pixels[np.array(doubtful, dtype=bool).reshape(shape)] = np.nan
+    return Centroids(pixels, spread, time, epipolar)
 
 
 def marker_tracks(table: pa.Table, name: str) -> dict[str, dict[int, tuple[Ints, Floats]]]:

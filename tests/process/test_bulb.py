@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from process.bulb import DOME, bases_m, by_dome, centres_m, wing_normals
+from process.bulb import DOME, bases_m, by_dome, centre_pixels, centres_m, wing_normals
 from process.camera_model import Light, MarkerLayout, RigSide
 from process.pipeline import markers
 from process.shared_error import (
@@ -68,6 +68,22 @@ def test_the_centre_of_a_dome_is_found_from_its_outlines(world):
         assert np.linalg.norm(found - places, axis=1).max() < 2e-5
         if tilt[2] == 1.0:
             assert np.linalg.norm(apparent - places, axis=1).min() > 0.8e-3  # what it would be wrong by
+
+
+def test_the_centres_pixels_are_found_of_a_light_in_one_camera_too(world):
+    side, places = world.rig.right, world.markers_m("right", 0.08, 0.05)
+    radius = 0.004
+    layout = dataclasses.replace(world.rig.markers, light=dataclasses.replace(LIGHT, dome_radius_m=radius))
+    normals = wing_normals("right", layout, places)
+    apparent = np.stack(outlines(world, "right", places, normals, radius), axis=1)
+    apparent[6, 1] = np.nan
+    known = np.where(np.arange(18)[:, None] == 6, np.nan, places)
+    found = centre_pixels(side, layout, "right", known[None], apparent[None])[0]
+    true = np.stack(world.project("right", places), axis=1)
+    seen_there = np.isfinite(apparent[:, :, 0])
+    assert np.linalg.norm(found - true, axis=2)[seen_there].max() < 0.1  # of 0.2 m away: perspective
+    assert np.linalg.norm(apparent - true, axis=2)[:6][seen_there[:6]].min() > 0.3
+    assert np.isnan(found[6, 1]).all()
 
 
 @pytest.mark.parametrize("side_name", ["left", "right"])

@@ -119,6 +119,35 @@ def test_the_table_does_not_depend_on_the_number_of_workers(flight, small_world,
     assert_same(markers([flight], small_world.rig, workers=3).table, result.table)
 
 
+def test_a_light_that_one_camera_saw(tmp_path, small_world, recording_writer, painter):
+    """It has that camera's pixels, their covariance and its row's time, but no place."""
+    writer = recording_writer(tmp_path / "right.mcap")
+    truth = {}
+    for trigger in range(3):
+        for camera, pixels in enumerate(
+            small_world.project("right", small_world.markers_m("right", curvature(trigger)))
+        ):
+            truth[trigger, camera] = pixels
+            canvas = painter(776, 1040, seed=10 * trigger + camera)
+            for marker, (u, v) in enumerate(pixels):
+                if (trigger, camera, marker) != (2, 1, 6):
+                    canvas.add(u, v, 0.6, 0.7, 140)
+            writer.frame("right", f"cam{camera}", trigger, canvas.image(), START_NS + trigger * PERIOD_NS)
+    writer.close()
+    rows = markers([tmp_path], small_world.rig, workers=1).table.to_pylist()
+    (row,) = [one for one in rows if one["flags"]]
+    assert (row["trigger_index"], row["marker"], row["flags"]) == (2, 6, "one_camera")
+    assert np.hypot(*(np.array([row["u0_px"], row["v0_px"]]) - truth[2, 0][6])) < 0.1
+    assert 0 < row["cov_uu0_px2"] < 0.01
+    assert np.isnan([row["x_m"], row["cov_xx_m2"], row["u1_px"], row["v1_px"], row["cov_vv1_px2"]]).all()
+    row0_ns = START_NS + 2 * PERIOD_NS + 1_000_000
+    assert abs(row["timestamp0_ns"] - row0_ns - row["v0_px"] * 10_000) <= 1
+    assert row["timestamp_ns"] == row["timestamp0_ns"]
+    assert row["timestamp1_ns"] == row["frame_timestamp_ns"]
+    both = rows[0]
+    assert abs((both["timestamp0_ns"] + both["timestamp1_ns"]) / 2 - both["timestamp_ns"]) <= 1
+
+
 def test_progress_reaches_the_end(flight, small_world):
     calls = []
     markers([flight], small_world.rig, progress=lambda done, total: calls.append((done, total)), workers=1)

@@ -44,7 +44,8 @@ def marker_table(places, sets=200, seed=1, path_m=None, side="right"):
     }
     rows = len(columns["side"])
     columns |= {"time_sigma_ns": np.zeros(rows), "ptp_state": np.full(rows, "SLAVE")}
-    return pa.table([pa.array(columns[name]) for name in MARKER_SCHEMA.names], schema=MARKER_SCHEMA)
+    schema = pa.schema([member for member in MARKER_SCHEMA if member.name in columns])
+    return pa.table([pa.array(columns[m.name]) for m in schema], schema=schema)
 
 
 def places_of(table):
