@@ -26,7 +26,7 @@ from typing import Any
 
 from capture.bench_rig import BenchCase, ClockedCamera, ClockedTriggers
 from capture.clock import Clock, SystemClock
-from capture.config import DiskConfig
+from capture.config import DiskConfig, driver_buffers
 from capture.disk import Disk, DiskFile, SystemDisk
 from capture.errors import DiskError, UsageError
 from capture.grabber import GRAB_TIMEOUT_S
@@ -183,6 +183,7 @@ def _lanes(case: BenchCase, folder: Path, disk: Disk, clock: Clock) -> tuple[Led
         triggers=triggers,
         clock=clock,
         ring_slots=case.ring_slots,
+        driver_buffers=driver_buffers(case.rate_hz),
         lock_memory=True,
     )
     cameras = [ClockedCamera(case, triggers) for _ in places]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from capture.camera.base import Camera, CameraDescription, CameraSettings, FrameStatus, Grab
-from capture.config import DRIVER_BUFFERS
+from capture.config import driver_buffers
 from capture.ring import Ring
 
 FOLLOWERS_SPARE_SLOTS = 4  # a camera that follows the disk leaves so many free: the sets that are under way need them
@@ -27,7 +27,7 @@ class BenchCase:
     @property
     def ring_slots(self) -> int:
         """Slots of each camera's ring."""
-        return round(self.stall_s * self.rate_hz) + DRIVER_BUFFERS
+        return round(self.stall_s * self.rate_hz) + driver_buffers(self.rate_hz)
 
 
 class ClockedTriggers:

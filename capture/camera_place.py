@@ -13,6 +13,23 @@ def camera_at(config: Config, place: CameraPlace) -> Camera:
     return make_camera(config.camera.backend, place.address, config.settings)
 
 
+def expected_at(config: Config, place: CameraPlace) -> CameraDescription:
+    """What a camera that is not there is taken for until it is: what the configuration says. Its model is unnamed."""
+    asked = config.settings
+    return CameraDescription(
+        model="",
+        serial=place.serial or "",
+        width=asked.width,
+        height=asked.height,
+        exposure_us=asked.exposure_us,
+        gain_db=asked.gain_db,
+        row_time_ns=round((config.camera.row_time_us or 0.0) * 1000.0),
+        tick_hz=1e9,
+        frame_id_bits=16,
+        hardware_trigger=True,
+    )
+
+
 def open_at(camera: Camera, config: Config, place: CameraPlace) -> CameraDescription:
     """Open it and check that it is the one that belongs here. Closing it is the caller's, whatever is raised.
 

@@ -269,6 +269,10 @@ def _print_report(report: FlightReport) -> None:
     Console().print(table)
     for remark in report.notes:
         say(f"note: {remark}")
+    for gate in sorted(report.marks.values(), key=lambda gate: gate.begin_ns)[:PROBLEMS_SHOWN]:
+        lasted = f"for {(gate.end_ns - gate.begin_ns) / 1e9:.1f} s" if gate.end_ns else "from then on"
+        after_s = (gate.begin_ns - report.first_trigger_ns) / 1e9
+        say(f"marked: {gate.name}, {after_s:.1f} s after the first trigger, {lasted}: {gate.cause}")
     for problem in report.problems[:PROBLEMS_SHOWN]:
         say(f"PROBLEM: {problem}")
     if len(report.problems) > PROBLEMS_SHOWN:

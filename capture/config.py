@@ -245,15 +245,23 @@ class Config(_Table):
     def ring_slots(self) -> int:
         """Slots of each camera's ring: the stall it must bridge (at least what a silent camera may claim of its
         partner's room, see capture.grabber.SideGate), and what the driver always holds."""
-        return max(math.ceil(self.ring.stall_s * self.trigger.rate_hz), DRIVER_BUFFERS + 1) + DRIVER_BUFFERS
+        buffers = driver_buffers(self.trigger.rate_hz)
+        return max(math.ceil(self.ring.stall_s * self.trigger.rate_hz), buffers + 1) + buffers
 
 
 GOOD_EXPOSURE_US = (1000, 5000)
 """Within it the paper's lights were found to be neither faint nor saturated (section on exposure, Figs. 11 to 13)."""
 
 DRIVER_BUFFERS = 10
-"""Buffers a driver is given, so that a full ring is met by us, with a cause, and not by the driver. At the start some
-of them are held back until the first frames are numbered (capture.numbering.CONFIRMING)."""
+"""Buffers that a driver is given at least, so that a full ring is met by us, with a cause, and not by the driver. At
+the start some of them are held back until the first frames are numbered (capture.numbering.CONFIRMING)."""
+STARVED_S = 0.4
+"""How long a busy machine may keep the read threads waiting before the driver has no buffer left."""
+
+
+def driver_buffers(rate_hz: float) -> int:
+    """Buffers a driver is given."""
+    return max(DRIVER_BUFFERS, math.ceil(STARVED_S * rate_hz))
 
 
 @dataclass(frozen=True)

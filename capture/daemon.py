@@ -13,12 +13,12 @@ from capture.analog import AnalogLog
 from capture.aux_log import AuxLog, Companion
 from capture.burst import give_burst, judge_burst
 from capture.camera.base import Camera, CameraDescription
-from capture.camera_place import camera_at, open_at
+from capture.camera_place import camera_at, expected_at, open_at
 from capture.clock import Clock
-from capture.config import Config, LoadedConfig
+from capture.config import Config, LoadedConfig, driver_buffers
 from capture.disk import Disk
-from capture.errors import DiskError
-from capture.flight import free_name, metadata_yaml
+from capture.errors import CameraError, DiskError
+from capture.flight import free_name, make_folder, metadata_yaml
 from capture.gates import Gates, judge_cameras, judge_clock
 from capture.grabber import STOP_DEADLINE_S, Absence, Grabber
 from capture.health_writer import HealthWriter
@@ -122,9 +122,10 @@ class Recording:
         self._config: Config = loaded.config
         self._clock = clock
         self._progress = progress
+        self._unattended = service is not None and service.managed
         started = datetime.datetime.fromtimestamp(clock.utc_ns() / 1e9, datetime.UTC)
         self.flight = self._config.flight or f"flight_{started:%Y%m%dT%H%M%SZ}"
-        if self._config.flight is None or (service is not None and service.managed):
+        if self._config.flight is None or self._unattended:
             self.flight = free_name(self.flight, (self._config.disks.left, self._config.disks.right))
         self._aux = AuxLog(clock)
         self._triggers = TriggerLog(self._config.trigger.rate_hz)
@@ -137,6 +138,7 @@ class Recording:
         own = [companion for companion in (self._ptp, self._analog) if companion is not None]
         self._companions = (*own, *companions, self._gates)
         self._service = service
+        self._missing: dict[Place, CameraError] = {}  # cameras that were not there at the start
         self._failures: list[str] = []
         self._flight_id = f"{self.flight}-{clock.utc_ns():x}"
         places = [(camera.side, camera.name) for camera in self._config.cameras]
@@ -204,10 +206,11 @@ class Recording:
         if start.burst and not run.in_flight:
             self._vitals.state = "test burst"
             rate_hz = self._config.trigger.rate_hz
+            there = {place: camera for place, camera in self._cameras.items() if place not in self._missing}
             judge_burst(
                 self._gates,
-                lambda: give_burst(self._cameras, run.board, run.strays, start.burst, rate_hz, self._clock),
-                list(self._cameras),
+                lambda: give_burst(there, run.board, run.strays, start.burst, rate_hz, self._clock),
+                list(there),
                 self._config.camera.time_sigma_limit_us,
             )
         return not stop.requested.is_set()
@@ -255,13 +258,46 @@ class Recording:
         return {side: lane.recorder for side, lane in self._lanes.items()}
 
     def _open_cameras(self, cleanup: contextlib.ExitStack) -> None:
+        """Open them. Without a person there, one that is missing is looked for during the recording instead."""
         for place in self._config.cameras:
             camera = camera_at(self._config, place)
             cleanup.callback(camera.close)
-            self._cameras[place.side, place.name] = (camera, open_at(camera, self._config, place))
+            try:
+                description = open_at(camera, self._config, place)
+            except CameraError as error:
+                if not self._unattended:
+                    raise
+                camera.close()
+                self._progress(f"{error}; the recording begins without it, and looks for it")
+                self._missing[place.side, place.name] = error
+                description = expected_at(self._config, place)
+            self._cameras[place.side, place.name] = (camera, description)
             self._step()
+        if len(self._missing) == len(self._cameras):
+            raise next(iter(self._missing.values()))
+
+    def _make_folders(self) -> dict[str, Path]:
+        """The flight's folder on each side's disk. Without a person there, a side whose disk is dead is left out."""
+        folders = {}
+        dead: list[DiskError] = []
+        for side in [side for side in SIDES if any(place[0] == side for place in self._cameras)]:
+            try:
+                folders[side] = make_folder(self._disk, getattr(self._config.disks, side), self.flight, side)
+            except DiskError as error:
+                if not self._unattended:
+                    raise
+                dead.append(error)
+                self._gates.judge(f"disk {side}", f"{error}; its cameras are left out")
+                for place in [place for place in self._cameras if place[0] == side]:
+                    self._cameras.pop(place)[0].close()
+                    self._ledger.leave_out(place)
+        if not folders:
+            raise dead[0]
+        self._failures += map(str, dead)
+        return folders
 
     def _make_lanes(self, board_name: str) -> None:
+        folders = self._make_folders()
         parts = LaneParts(
             disk=self._disk,
             disk_config=self._config.disks,
@@ -270,6 +306,7 @@ class Recording:
             triggers=self._triggers,
             clock=self._clock,
             ring_slots=self._config.ring_slots,
+            driver_buffers=driver_buffers(self._config.trigger.rate_hz),
             lock_memory=self._config.ring.lock_memory,
             threads=self._config.threads,
             calibration=self._calibration(),
@@ -279,13 +316,14 @@ class Recording:
         )
         camera = self._config.camera
         check_ring_memory(len(self._cameras), self._config.ring_slots, camera.width, camera.height)
-        sides = [side for side in SIDES if any(place[0] == side for place in self._cameras)]
-        folders = {side: self._make_folder(side) for side in sides}
-        for side in sides:
+        for side in folders:
             cameras = {name: camera for (camera_side, name), camera in self._cameras.items() if camera_side == side}
-            other = next((folders[s] for s in sides if s != side), None)
+            other = next((folder for s, folder in folders.items() if s != side), None)
             spare = (self._disk, other) if self._config.disks.takeover and other is not None else None
             self._lanes[side] = make_lane(side, folders[side], cameras, parts, spare)
+        for place, error in self._missing.items():
+            if place in self._cameras:
+                self._grabbers[place].begin_absent(error)
         rings = [grabber.ring for grabber in self._grabbers.values()]
         total_mb = sum(ring.slots * ring.slot_bytes for ring in rings) / 1e6
         locked = all(ring.locked for ring in rings)
@@ -310,18 +348,6 @@ class Recording:
     def _calibration(self) -> tuple[str, bytes] | None:
         path, content = self._config.calibration, self._loaded.calibration
         return None if path is None or content is None else (path.name, content)
-
-    def _make_folder(self, side: str) -> Path:
-        disk: Path = getattr(self._config.disks, side)
-        folder = disk / self.flight
-        try:
-            self._disk.make_folder(folder)
-        except OSError as error:
-            raise DiskError(
-                f"{disk}: cannot be written ({error.strerror}): mount the disk or make this folder, "
-                f"or correct `disks.{side}`"
-            ) from error
-        return folder
 
     def _control(self, run: TriggerRun, stop: StopRule, started_s: float) -> None:
         next_report_s = started_s + DIAGNOSTICS_PERIOD_S
@@ -456,7 +482,7 @@ class Recording:
         recorded = sum(camera.recorded for camera in health.cameras)
         lost = sum(camera.lost_total for camera in health.cameras)
         depth = max((camera.ring_in_use for camera in health.cameras), default=0)
-        if self._service is not None:
+        if self._service is not None and self.state != "stopping":  # whose statuses are no news
             self._service.statuses(statuses)
         totals = self._progress if self._service is None else self._service.totals
         totals(

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from capture.errors import RecordingError
+from capture.disk import Disk
+from capture.errors import DiskError, RecordingError
 from capture.segment import SegmentWriter
 
 
@@ -40,6 +41,22 @@ def free_name(name: str, disks: Sequence[Path]) -> str:
         number += 1
         free = f"{name}_{number}"
     return free
+
+
+def make_folder(disk: Disk, parent: Path, flight: str, side: str) -> Path:
+    """A new flight's folder on a side's disk.
+
+    Raises:
+        DiskError: the disk cannot be written.
+    """
+    try:
+        disk.make_folder(parent / flight)
+    except OSError as error:
+        raise DiskError(
+            f"{parent}: cannot be written ({error.strerror}): mount the disk or make this folder, "
+            f"or correct `disks.{side}`"
+        ) from error
+    return parent / flight
 
 
 def metadata_yaml(segments: Sequence[SegmentWriter]) -> str:

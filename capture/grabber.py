@@ -37,8 +37,9 @@ class SideGate:
 
     _REMEMBERED = 64
 
-    def __init__(self, rings: list[Ring]) -> None:
+    def __init__(self, rings: list[Ring], driver_buffers: int = DRIVER_BUFFERS) -> None:
         self._rings = rings
+        self._driver_buffers = driver_buffers
         self._promised: dict[int, set[int]] = {id(ring): set() for ring in rings}
         self._decisions: dict[int, bool] = {}
         self._mutex = threading.Lock()
@@ -56,7 +57,7 @@ class SideGate:
             return ring.take()
 
     def _decide(self, index: int) -> None:
-        room = all(ring.free > min(len(self._promised[id(ring)]), DRIVER_BUFFERS) for ring in self._rings)
+        room = all(ring.free > min(len(self._promised[id(ring)]), self._driver_buffers) for ring in self._rings)
         self._decisions[index] = room
         if room:
             for promised in self._promised.values():
@@ -75,6 +76,7 @@ class ReadParts:
     ledger: Ledger
     triggers: Triggers
     clock: Clock
+    driver_buffers: int = DRIVER_BUFFERS
     clock_state: Callable[[], ClockState] = lambda: FREE_RUNNING  # of this computer, asked for each frame
     trigger_latency_ns: int = 0  # from a trigger to the start of row 0's exposure
     judge: Callable[[str, str | None], None] = lambda name, cause: None  # marks what is not in order: capture.gates
@@ -115,6 +117,7 @@ class Grabber(Worker):
         self.seek_error = ""  # why the last try to have the camera back failed
         self.temperature_c: float | None = None
         self._camera = camera
+        self._driver_buffers = parts.driver_buffers
         self._description = description
         self._layout = layout
         self._gate = gate
@@ -134,7 +137,7 @@ class Grabber(Worker):
 
     def arm(self) -> None:
         """Give the driver its buffers and make the camera ready for triggers. Before ``start``."""
-        while len(self._slots) < DRIVER_BUFFERS and (slot := self.ring.take()) is not None:
+        while len(self._slots) < self._driver_buffers and (slot := self.ring.take()) is not None:
             self._slots.add(slot)
         for slot in sorted(self._slots):
             self._queue(slot)
@@ -158,39 +161,45 @@ class Grabber(Worker):
         """
         try:
             while not self.stop_requested.is_set():
+                self.turn()
+                if self.is_absent:
+                    if not self.stop_requested.wait(SEEK_PERIOD_S):
+                        self.seek()
+                    continue
                 try:
-                    self.turn()
                     self.step(GRAB_TIMEOUT_S)
                     self._take_temperature()
                 except CameraLost as error:
                     self.lose(error)
-                    while not self.stop_requested.wait(SEEK_PERIOD_S) and not self.seek():
-                        pass
         finally:
             self.finish()
             self._camera.disarm()
         if self.is_absent:
             raise CameraLost(f"{'/'.join(self.place)}: {self.absences[-1].cause}")
 
+    def begin_absent(self, error: CameraError) -> None:
+        """The camera is not there from the beginning: it is looked for as one that goes. Instead of ``arm``."""
+        self._go(f"{error}; it was not there at the start")
+
     def lose(self, error: CameraLost) -> None:
         """The camera is gone: take what it had delivered; from here on its triggers are lost."""
         self._flush()
         last = f"its last frame was of trigger {self._last_index}" if self._last_index >= 0 else "it gave no frame"
-        cause = f"{error}; {last}"
+        self._go(f"{error}; {last}")
+        self._camera.disarm()
+        self._camera.close()
+
+    def _go(self, cause: str) -> None:
         self.absences.append(Absence(self._parts.clock.utc_ns(), 0, cause))
         self._parts.judge(self._gate_name, cause)
         self._ledger.absent(self.place, cause)
-        self._camera.disarm()
-        self._camera.close()
 
     def seek(self) -> bool:
         """Book the triggers that went by, and try once to have the camera back; whether it is."""
         absence = self.absences[-1]
         self._ledger.absent(self.place, absence.cause)
         try:
-            found = self._camera.open()
-            if found.serial != self._description.serial:
-                raise CameraError(f"serial {found.serial} answers, not {self._description.serial}: swap the cables")
+            self._recognise(self._camera.open())
             self._numbering, self._frame_clock = self._aligned(self._description)
             self._ledger.absent(self.place, absence.cause)
             self.arm()
@@ -203,6 +212,16 @@ class Grabber(Worker):
         self.absences[-1] = dataclasses.replace(absence, end_ns=self._parts.clock.utc_ns())
         self._parts.judge(self._gate_name, None)
         return True
+
+    def _recognise(self, found: CameraDescription) -> None:
+        """See that this is the camera that belongs here. One that was not there at the start is known from now on."""
+        known = self._description
+        if known.serial and found.serial != known.serial:
+            raise CameraError(f"serial {found.serial} answers, not {known.serial}: swap the cables")
+        if not found.hardware_trigger:
+            raise CameraError(f"{found.model} has no hardware trigger: it cannot be synchronised")
+        if not known.model:
+            self._description = dataclasses.replace(found, row_time_ns=known.row_time_ns or found.row_time_ns)
 
     def step(self, timeout_s: float) -> bool:
         """Take one frame on its way, when there is one within ``timeout_s``."""

@@ -39,7 +39,8 @@ class Lane:
         """Start the write thread, arm the cameras, start the read threads."""
         self.recorder.start()
         for grabber in self.grabbers.values():
-            grabber.arm()
+            if not grabber.is_absent:
+                grabber.arm()
             grabber.start()
 
 
@@ -90,7 +91,7 @@ def make_lane(
         for name in names
     }
     rings = {name: Ring(parts.ring_slots, layouts[name].slot_bytes, parts.lock_memory) for name in names}
-    gate = SideGate(list(rings.values()))
+    gate = SideGate(list(rings.values()), parts.driver_buffers)
     grabbers = {
         name: Grabber((side, name), camera, description, rings[name], layouts[name], gate, recorder, parts)
         for name, (camera, description) in cameras.items()

@@ -56,6 +56,11 @@ class Ledger:
         self._on_loss = on_loss
         self._mutex = threading.Lock()
 
+    def leave_out(self, place: Place) -> None:
+        """This camera takes no part. Before the first trigger."""
+        with self._mutex:
+            del self._accounts[place]
+
     def triggered(self, next_index: int) -> None:
         """The board has given all triggers below ``next_index``."""
         with self._mutex:

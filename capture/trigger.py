@@ -47,6 +47,7 @@ class TriggerLog:
         self._times_ns: list[int] = []
         self._untrusted: set[int] = set()
         self._steps: list[tuple[int, int]] = [(0, 0)]  # from an index on, UTC minus our time
+        self._silent = False  # a report did not come, and none has since
         self._changed = threading.Condition()
 
     def add(self, pulse: Pulse, trusted: bool = True, step_ns: int = 0) -> bool:
@@ -77,17 +78,20 @@ class TriggerLog:
             if len(self._indices) > 2 * _PULSES_KEPT:
                 del self._indices[:_PULSES_KEPT], self._times_ns[:_PULSES_KEPT]
                 self._untrusted = {index for index in self._untrusted if index >= self._indices[0]}
+            self._silent = False
             self._changed.notify_all()
             return True
 
     def nearest(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
         """Index and time of the trigger nearest to ``time_ns``, both in this log's time.
 
-        Waits up to ``wait_s`` for the board's report of it. A trigger that was not reported is reckoned from its
-        neighbour and the period. None when the board has not reported any pulse.
+        Waits up to ``wait_s`` for the board's report of it; not again, while none come. A trigger that was not
+        reported is reckoned from its neighbour and the period. None when the board has not reported any pulse.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._reported_until(time_ns), wait_s)
+            self._silent = not self._changed.wait_for(
+                lambda: self._reported_until(time_ns), 0.0 if self._silent else wait_s
+            )
             if not self._indices:
                 return None
             after = bisect.bisect_left(self._times_ns, time_ns)

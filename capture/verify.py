@@ -11,7 +11,7 @@ from typing import Any
 from capture.errors import RecordingError, UsageError
 from capture.flight import find_folders
 from capture.other_books import OtherBooks
-from capture.record import LOSS_TOPIC, SIDES, TRIGGER_TOPIC, Frame, Loss, Trigger, decode_image
+from capture.record import GATE_TOPIC, LOSS_TOPIC, SIDES, TRIGGER_TOPIC, Frame, Gate, Loss, Trigger, decode_image
 from capture.scan import Scan, ScannedMessage, scan
 
 
@@ -43,6 +43,7 @@ class FlightReport:
     provenance: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)  # any of them: not whole
     notes: list[str] = field(default_factory=list)  # accounted for, but worth knowing
+    marks: dict[tuple[str, int], Gate] = field(default_factory=dict)  # what was not in order, by name and begin
 
     @property
     def whole(self) -> bool:
@@ -105,6 +106,7 @@ class FlightReport:
             "version": self.provenance.get("version", ""),
             "problems": self.problems,
             "notes": self.notes,
+            "marks": [vars(gate) for _, gate in sorted(self.marks.items(), key=lambda item: item[1].begin_ns)],
         }
 
 
@@ -151,6 +153,10 @@ def _take(report: FlightReport, path: Path, message: ScannedMessage, pulses: dic
         if message.topic == TRIGGER_TOPIC:
             pulse = Trigger.decode(message.data)
             pulses[pulse.index] = pulse
+        elif message.topic == GATE_TOPIC:
+            gate = Gate.decode(message.data)
+            if gate.end_ns or (gate.name, gate.begin_ns) not in report.marks:
+                report.marks[gate.name, gate.begin_ns] = gate
         elif message.topic == LOSS_TOPIC:
             loss = Loss.decode(message.data)
             _camera(report, loss.side, loss.camera).lost_indices[loss.trigger_index] = loss

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from rich import box
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
@@ -134,19 +135,21 @@ def _live(folder: Path, expected: int) -> None:
 
 
 def _shown(aims: list[Aim]) -> Group:
-    table = Table("camera", "markers", "saturated", "level", "background", "width px", "edge px", "circularity", "halo")
+    table = Table(box=box.SIMPLE_HEAD)
+    for title in ("camera", "markers", "saturated", "level", "scene", "width", "edge", "round", "halo"):
+        table.add_column(title, no_wrap=True)
     for found in aims:
         look = found.look
         table.add_row(
             found.place,
-            f"{look.markers} of {found.expected}",
-            f"{look.saturated_markers} · {100 * look.saturated_share:.2f} %",
-            f"{_figure(look.amplitude, 0)} … {_figure(look.brightest, 0)}",
-            f"{look.background:.0f} … {look.background_high:.0f}",
+            f"{look.markers}/{found.expected}",
+            f"{look.saturated_markers}, {100 * look.saturated_share:.1f}%",
+            f"{_figure(look.amplitude, 0)}…{_figure(look.brightest, 0)}",
+            f"{look.background:.0f}…{look.background_high:.0f}",
             _figure(look.diameter_px, 1),
             _figure(look.edge_px, 2),
             _figure(look.circularity, 2),
-            "–" if look.halo != look.halo else f"{100 * look.halo:.0f} %",
+            "–" if look.halo != look.halo else f"{100 * look.halo:.0f}%",
             style="green" if found.good else "bold red",
         )
     lines = [Text(f"{found.place}: {advice.text}") for found in aims for advice in found.advice]

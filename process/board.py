@@ -23,11 +23,15 @@ REFINE_RADIUS_PX = 10.0  # of the window around a corner; beyond it, lens distor
 
 @dataclass(frozen=True)
 class Board:
-    """A checkerboard: inner corners in a row, rows, and the side of a square."""
+    """A checkerboard: inner corners in a row, rows, and the side of a square; a ChArUco board with its markers."""
 
     columns: int
     rows: int
     square_m: float
+    charuco: str | None = None
+    """OpenCV's name of the markers' dictionary; None: a plain checkerboard"""
+    marker_m: float = 0.0
+    """side of a marker"""
 
     @classmethod
     def parse(cls, size: str, square_mm: float) -> Self:
@@ -56,7 +60,7 @@ class Board:
     @property
     def looks_the_same_upside_down(self) -> bool:
         """Whether half a turn maps black squares on black squares, so that corners cannot be told apart."""
-        return (self.columns + self.rows) % 2 == 0
+        return self.charuco is None and (self.columns + self.rows) % 2 == 0
 
 
 @dataclass(frozen=True, eq=False)

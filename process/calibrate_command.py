@@ -4,6 +4,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,22 +17,33 @@ from capture.console import note, say, say_json
 from capture.errors import ProcessError, UsageError
 from process.board import Board
 from process.calibrate import CalibrationSettings, Method, calibration_covariance_m2
+from process.calibration_recording import find_in_recording
 from process.calibration_report import write_report
 from process.calibration_session import SessionCalibration, calibrate_session, find_session, image_pairs
 from process.camera_model import write_pair
+from process.charuco import dictionary
 from process.json_file import finite_or_none, provenance
+from process.recording import Recording, open_recording
 
 RANGES_M = (1.0, 2.0, 3.0)
 
 
 def calibrate(
-    cam0: Annotated[
-        str, typer.Option(help="Images of the left camera: a quoted pattern such as 'A*.png', or a folder.")
-    ],
-    cam1: Annotated[str, typer.Option(help="Images of the right camera, in the same order.")],
     board: Annotated[str, typer.Option(help="Inner corners of the checkerboard, such as 10x7.")],
     square_mm: Annotated[float, typer.Option(help="Side of one square.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The pair's file to write (JSON).")],
+    flight: Annotated[
+        list[Path] | None, typer.Argument(help="A recording in which a board is held still in many places, one by one.")
+    ] = None,
+    side: Annotated[str | None, typer.Option(help="Of a recording: the pair to calibrate, left or right.")] = None,
+    cam0: Annotated[
+        str | None, typer.Option(help="Images of the left camera: a quoted pattern such as 'A*.png', or a folder.")
+    ] = None,
+    cam1: Annotated[str | None, typer.Option(help="Images of the right camera, in the same order.")] = None,
+    charuco: Annotated[
+        str | None, typer.Option(help="The board is a ChArUco one with markers of this dictionary, such as 4X4_50.")
+    ] = None,
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a ChArUco board's marker.")] = None,
     method: Annotated[
         Method, typer.Option(help="Everything at once, or the paper's way: each camera alone, then the pose between.")
     ] = Method.joint,
@@ -45,21 +57,25 @@ def calibrate(
     workers: Annotated[int, typer.Option(min=1, max=2, help="Processes that look for corners.")] = 2,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Calibrate a camera pair from images of a checkerboard seen by both cameras at the same time."""
+    """Calibrate a camera pair from images, or a recording, of a board seen by both cameras at the same time."""
     if distortion_terms not in (2, 5):
         raise UsageError(f"--distortion-terms {distortion_terms}: 2 or 5")
-    target = Board.parse(board, square_mm)
-    pairs = image_pairs(cam0, cam1)
+    target = _board(board, square_mm, charuco, marker_mm)
+    source = _source(flight or [], side, cam0, cam1)
     for path in filter(None, (output, report)):
         if not path.resolve().parent.is_dir():
             raise ProcessError(f"{path.parent}: no such folder to write to; make it first")
     with _progress() as progress:
-        session = find_session(pairs, target, workers, progress)
+        if isinstance(source, list):
+            session = find_session(source, target, workers, progress)
+        else:
+            session = find_in_recording(*source, target, workers, progress)
     settings = CalibrationSettings(method, nominal_board, distortion_terms)
     result = calibrate_session(session, settings)
     summary = summarise(result, target)
     command = shlex.join(["wingproc", *sys.argv[1:]])
-    made = provenance(command, [path for pair in pairs for path in pair])
+    # of a recording the command says which; its files are too large to be hashed here
+    made = provenance(command, [path for pair in source for path in pair] if isinstance(source, list) else [])
     calibration = result.calibration
     write_pair(
         output,
@@ -81,12 +97,45 @@ def calibrate(
         _print(summary, output, report)
 
 
+def _source(
+    flight: list[Path], side: str | None, cam0: str | None, cam1: str | None
+) -> list[tuple[Path, Path]] | tuple[Recording, str]:
+    """Pairs of image files, or a recording and a side of it. UsageError when it is neither or both."""
+    if flight:
+        if cam0 or cam1:
+            raise UsageError("give a recording, or --cam0 and --cam1, not both")
+        if side not in ("left", "right"):
+            raise UsageError("a recording needs --side left or --side right: the pair to calibrate")
+        return open_recording(flight), side
+    if side is not None:
+        raise UsageError("--side is of a recording: name its folder")
+    if not cam0 or not cam1:
+        raise UsageError("give --cam0 and --cam1, images of both cameras, or a recording's folder with --side")
+    return image_pairs(cam0, cam1)
+
+
+def _board(size: str, square_mm: float, charuco: str | None, marker_mm: float | None) -> Board:
+    board = Board.parse(size, square_mm)
+    if charuco is None:
+        if marker_mm is not None:
+            raise UsageError("--marker-mm is a ChArUco board's: give its --charuco dictionary, too")
+        return board
+    if marker_mm is None or not 0.0 < marker_mm < square_mm:
+        raise UsageError(f"--charuco {charuco}: give --marker-mm, the side of a marker, smaller than the square's")
+    try:
+        dictionary(charuco)
+    except KeyError:
+        raise UsageError(f"--charuco {charuco}: OpenCV has no such dictionary; 4X4_50 or 5X5_100 are some") from None
+    return replace(board, charuco=charuco, marker_m=marker_mm / 1000.0)
+
+
 def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
     """What is printed, and written beside the parameters."""
     calibration = result.calibration
     pair = calibration.pair
     view_rms_px = np.sqrt(np.nanmean(np.sum(calibration.residuals_px**2, axis=-1), axis=2))
     print_error = calibration.board_m - board.points_m
+    names = result.seen
     return {
         "cameras": [
             {
@@ -109,6 +158,15 @@ def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
             "finders": list(result.finders),
             "finder_rms_px": list(result.finder_rms_px),
             "predicted_sigma_mm": _predicted_sigma_mm(result),
+            "odd_corners": [
+                {
+                    "view": str(names[view][camera]),
+                    "column": corner % board.columns + 1,
+                    "row": corner // board.columns + 1,
+                    "residual_px": off_px,
+                }
+                for camera, view, corner, off_px in calibration.odd_corners
+            ],
             "warnings": calibration.warnings,
         },
         "board": {
@@ -149,6 +207,10 @@ def _print(summary: dict[str, Any], output: Path, report: Path | None) -> None:
     for view in summary["views"]:
         if not view["used"]:
             say(f"  left out   {Path(view['cam0']).name}, {Path(view['cam1']).name}: {view['reason']}")
+    for odd in detail["odd_corners"]:
+        place = f"column {odd['column']}, row {odd['row']}"
+        name = Path(odd["view"]).name
+        say(f"  left out   {name}, corner at {place}: {odd['residual_px']:.2f} px off, hidden or a gleam")
     say("             RMS px   alone px        fx        fy        cx        cy")
     for name, camera in zip(("cam0", "cam1"), summary["cameras"], strict=True):
         K = camera["K"]

@@ -25,8 +25,10 @@ from process.calibrate import (
     check_poses_differ,
     start_alone,
 )
+from process.charuco import find_charuco
 
 Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 WORKERS = 2
@@ -53,6 +55,8 @@ class SessionCalibration:
     finder_rms_px: tuple[dict[str, float], dict[str, float]]
     used: list[tuple[Path, Path]]
     rejected: list[tuple[Path, Path, str]]
+    seen: list[tuple[Path, Path]]
+    """views in which the board was found: what ``calibration.used`` and ``odd_corners`` count"""
     corners_px: Array
     """(2, views used, N, 2)"""
 
@@ -146,7 +150,12 @@ def _find_one(job: tuple[Path, Board]) -> tuple[View, tuple[int, int]]:
     image = read_grey(path)
     refuse_blank(path, image)
     cv2.setNumThreads(1)
-    return find_corners(path, image, board), (image.shape[1], image.shape[0])
+    return find_board(path, image, board), (image.shape[1], image.shape[0])
+
+
+def find_board(path: Path, image: Image, board: Board) -> View:
+    """Corners of the board in ``image``, a plain one or a ChArUco one."""
+    return find_corners(path, image, board) if board.charuco is None else find_charuco(path, image, board)
 
 
 def calibrate_session(session: Session, settings: CalibrationSettings) -> SessionCalibration:
@@ -176,6 +185,7 @@ def calibrate_session(session: Session, settings: CalibrationSettings) -> Sessio
         (chosen[0][2], chosen[1][2]),
         [(seen[view][0].path, seen[view][1].path) for view in result.used],
         rejected,
+        [(first.path, second.path) for first, second in seen],
         corners[:, result.used],
     )
 
@@ -193,17 +203,18 @@ def _choose_finder(
     views: Sequence[View], session: Session, settings: CalibrationSettings
 ) -> tuple[Array, str, dict[str, float]]:
     """Corners (V, N, 2) by the finder with the smallest residual of this camera alone, where all finders succeeded."""
-    complete = [view for view in views if all(name in view.corners for name in FINDERS)]
+    finders = FINDERS if session.board.charuco is None else ("edges", "subpix")
+    complete = [view for view in views if all(name in view.corners for name in finders)]
     rms: dict[str, float] = {}
     board_moves = not settings.nominal_board and len(complete) >= MIN_VIEWS_FOR_PRINT
     if len(complete) >= MIN_VIEWS:
-        for name in FINDERS:
+        for name in finders:
             corners = np.stack([view.corners[name] for view in complete])
             check_poses_differ(corners, session.board, session.size_px)
             start, _ = start_alone(corners, session.board, session.size_px, settings.distortion_terms)
             freedom = Freedom(distortion_terms=settings.distortion_terms, board=board_moves)
             rms[name] = adjust(corners[None], start, freedom).rms_px
-    order = sorted(FINDERS, key=lambda name: rms.get(name, np.inf))  # stable: without residuals, FINDERS' order
+    order = sorted(finders, key=lambda name: rms.get(name, np.inf))  # stable: without residuals, FINDERS' order
     corners = np.stack([next(view.corners[name] for name in order if name in view.corners) for view in views])
     return corners, order[0], rms
 

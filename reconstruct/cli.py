@@ -83,6 +83,9 @@ def run_command(
         typer.Option(help=f"Aerodynamic loads too, by these signals of the aircraft's acceleration: {NAMES}."),
     ] = None,
     csv: Annotated[bool, typer.Option(help="Write the tables as CSV too.")] = True,
+    mat: Annotated[bool, typer.Option(help="Write result.mat for MATLAB.")] = True,
+    mcap: Annotated[bool, typer.Option(help="Write wing.mcap, the wing in 3-D for Foxglove.")] = True,
+    netcdf: Annotated[bool, typer.Option(help="Write result.nc (NetCDF; needs xarray).")] = False,
     report: Annotated[bool, typer.Option(help="Draw the report; `reconstruct report` can do so later.")] = True,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
     scheduler: Annotated[
@@ -103,8 +106,9 @@ def run_command(
         raise UsageError(
             "--dbc is for a flight: a marker table has its signals beside it, from `wingproc markers --dbc`"
         )
+    also = tuple(name for name, wanted in (("mat", mat), ("mcap", mcap), ("netcdf", netcdf)) if wanted)
     job = Job(
-        *(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest, report, scheduler),
+        *(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest, also, report, scheduler),
         dbc=tuple(dbc or ()),
         max_gap_s=max_gap,
         direct=direct,
@@ -137,13 +141,20 @@ def compare_command(
     out: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder for comparison and report; RESULT if not given.")
     ] = None,
+    from_start: Annotated[
+        bool, typer.Option("--from-start", help="Two flights, or a simulation's own time: count both from their start.")
+    ] = False,
+    reference_window: Annotated[
+        str | None, typer.Option(help="Compare displacements from the mean of these seconds of RESULT too, A:B.")
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the comparison as JSON.")] = False,
 ) -> None:
     """Compare a result with a reference, and add the errors to the report."""
     folder = out or result
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder}: is a file; give a folder for the comparison")
-    found = run_comparison(result, reference, folder, _command()).summary
+    window = None if reference_window is None else parse_window(reference_window, "--reference-window")
+    found = run_comparison(result, reference, folder, _command(), from_start=from_start, window=window).summary
     if json:
         say_json(found)
         return
@@ -153,9 +164,12 @@ def compare_command(
         ("shape error", "shape_rms_mm", "mm RMS, 3-D, all stations"),
         ("tip error", "tip_error_mm", "mm RMS, 3-D"),
         ("twist error", "twist_rms_deg", "deg RMS, all stations"),
+        ("moved", "displacement_rms_mm", "mm RMS, 3-D, displacements from the window"),
+        ("twisted", "displacement_twist_rms_deg", "deg RMS, from the window"),
         ("within 95 %", "shape_within_95_percent", "% of the position errors are within 1.96 sigma"),
     ):
-        say(f"{name:<15} {'not known' if found[key] is None else f'{found[key]:.3f} {unit}'}")
+        if key in found:
+            say(f"{name:<15} {'not known' if found[key] is None else f'{found[key]:.3f} {unit}'}")
     say(f"report          {folder / REPORT}")
 
 

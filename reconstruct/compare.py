@@ -1,7 +1,7 @@
 """A result folder and a reference folder (truth, simulation, another result) → the errors of the result."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,9 @@ from scipy.interpolate import CubicSpline
 
 from capture.errors import UsageError
 from process.json_file import finite_or_none
+from process.reference import Window
 from reconstruct.tables import (
+    FRAMES,
     MARKERS,
     SHAPE,
     Bools,
@@ -54,36 +56,91 @@ class _MarkerErrors:
     xyz_m: Floats  # (F, M, 3)
 
 
-def compare(result: Path, reference: Path) -> Comparison:
+def compare(result: Path, reference: Path, *, from_start: bool = False, window: Window | None = None) -> Comparison:
     """Compare the folder ``result`` with the folder ``reference``.
 
     The reference is interpolated by cubic splines: in time to the result's instants (each marker's own, and each
     set's common one), and along the span to the result's stations. Instants before, after or in a gap of the
-    reference and stations beyond its end are counted and left out. Raises UsageError when a folder or table is missing
-    or cannot be used, and when nothing of the two overlaps.
+    reference and stations beyond its end are counted and left out. A reference without markers is compared by its
+    shape.
+
+    Args:
+        result: of `reconstruct run`.
+        reference: truth, simulation or another result.
+        from_start: each counts time from its first set: two flights, or a simulation with a time of its own.
+        window: seconds of the result in which the wing is at rest: what its displacements from there are off by too.
+
+    Raises:
+        UsageError: a folder or table is missing or cannot be used, the two are in the wrong order, or nothing of them
+            overlaps.
     """
-    for folder in (result, reference):
-        if not folder.is_dir():
-            raise UsageError(f"{folder}: no such folder; give a result of `reconstruct run` and a reference like it")
+    _check_folders(result, reference)
     shape_file, marker_file = str(reference / SHAPE), str(reference / MARKERS)
     shapes = shape_series(read_table(result / SHAPE, ()), str(result / SHAPE))
     true_shapes = shape_series(read_table(reference / SHAPE, ()), shape_file, reference=True)
+    start_ns = min(int(one.timestamp_ns[0]) for one in shapes.values())
+    later_ns = start_ns - min(int(one.timestamp_ns[0]) for one in true_shapes.values()) if from_start else 0
+    true_shapes = {side: replace(one, timestamp_ns=one.timestamp_ns + later_ns) for side, one in true_shapes.items()}
     shape = [_shape_errors(shapes[side], true_shapes[side], shape_file) for side in shapes if side in true_shapes]
     markers = marker_series(read_table(result / MARKERS, ()), str(result / MARKERS))
-    tracks = marker_tracks(read_table(reference / MARKERS, ()), marker_file)
-    marker = [_marker_errors(markers[side], tracks[side], marker_file) for side in markers if side in tracks]
+    tracks = _tracks(reference / MARKERS, later_ns)
+    marker = [_marker_errors(markers[side], tracks.get(side, {}), marker_file) for side in markers]
     if not any(np.isfinite(errors.xyz_m).any() for errors in shape):
         raise UsageError(
-            f"{reference}: has no set at the time of a fitted set of {result}; are both of the same flight?"
+            f"{reference}: has no set at the time of a fitted set of {result}; are both of the same flight? If not, "
+            "--from-start counts both times from their first sets"
         )
     summary = {
         "result": str(result),
         "reference": str(reference),
         **_shape_summary(shape),
+        **_displacement_summary(shape, window, start_ns),
         **_marker_summary(marker),
         "sides": {errors.series.side: _shape_summary([errors]) for errors in shape},
     }
     return Comparison(summary, _shape_table(shape), _marker_table(marker))
+
+
+def _check_folders(result: Path, reference: Path) -> None:
+    for folder in (result, reference):
+        if not folder.is_dir():
+            raise UsageError(f"{folder}: no such folder; give a result of `reconstruct run` and a reference like it")
+    if (reference / FRAMES).is_file() and not (result / FRAMES).is_file():
+        raise UsageError(
+            f"{result}: is no result of `reconstruct run`, {reference} is one: the result comes first "
+            "(reconstruct compare RESULT REFERENCE)"
+        )
+
+
+def _tracks(path: Path, later_ns: int) -> dict[str, dict[int, tuple[Ints, Floats]]]:
+    if not path.is_file():
+        return {}  # a simulation's shapes alone
+    found = marker_tracks(read_table(path, ()), str(path))
+    return {
+        side: {marker: (times_ns + later_ns, xyz_m) for marker, (times_ns, xyz_m) in tracks.items()}
+        for side, tracks in found.items()
+    }
+
+
+def _displacement_summary(shape: list[_ShapeErrors], window: Window | None, start_ns: int) -> dict[str, Any]:
+    """Errors of displacements from the mean over ``window``: what is the same there and later cancels."""
+    if window is None:
+        return {}
+    xyz, twist = [], []
+    for one in shape:
+        since_s = (one.series.timestamp_ns - start_ns) * 1e-9
+        chosen = (since_s >= window.begin_s) & (since_s <= window.end_s) & np.isfinite(one.xyz_m[:, 0, 0])
+        if not chosen.any():
+            raise UsageError(
+                f"--reference-window {window.begin_s:g}:{window.end_s:g}: no set of the {one.series.side} wing can be "
+                "compared in it"
+            )
+        xyz.append((one.xyz_m - one.xyz_m[chosen].mean(axis=0)).reshape(-1, 3))
+        twist.append((one.twist_deg - one.twist_deg[chosen].mean(axis=0)).ravel())
+    return {
+        "displacement_rms_mm": _rms_mm(np.concatenate(xyz)),
+        "displacement_twist_rms_deg": _rms(np.concatenate(twist)),
+    }
 
 
 def interpolate_shape(series: ShapeSeries, timestamp_ns: Ints, s_m: Floats, name: str) -> tuple[Floats, Floats]:
@@ -278,4 +335,4 @@ def _marker_table(errors: list[_MarkerErrors]) -> pa.Table:
                 }
             )
         )
-    return pa.concat_tables(parts) if parts else pa.table({"trigger_index": pa.array([], pa.int64())})
+    return pa.concat_tables(parts)

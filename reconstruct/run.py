@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +20,7 @@ from process.memory import MemoryWatch
 from process.parts import PartStore
 from process.pipeline import PipelineSettings
 from process.recording import Recording, find_files, open_recording
+from process.reference import Window
 from process.shared_error import layout_of, sides_of, with_rig
 from process.signal_table import MAX_GAP_S
 from process.tables import MARKER_SCHEMA, TableWriter, write_table
@@ -28,6 +29,7 @@ from reconstruct.air_table import AIR, SpecificForce, air_table
 from reconstruct.assemble import Target, assemble
 from reconstruct.beside import Beside, beside_flight, beside_markers
 from reconstruct.compare import Comparison, compare
+from reconstruct.dense import MAT, NETCDF, write_mat, write_netcdf
 from reconstruct.hang import DOUBTFUL_SIGMAS, recorded_hangs
 from reconstruct.identify import identify
 from reconstruct.iteration import FEWEST_MARKERS
@@ -35,6 +37,7 @@ from reconstruct.observed import measured_markers
 from reconstruct.reference import Reference
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_result
+from reconstruct.scene import SCENE, write_scene
 from reconstruct.series import half_of
 from reconstruct.shared import SharedError, shared_errors
 from reconstruct.stages import Cameras, FitPlan, Key, fit, measure, sampled, take
@@ -43,6 +46,7 @@ from reconstruct.tables import FRAMES, LOADS, MARKERS, RESIDUALS, SHAPE, SIDES, 
 from reconstruct.wing import Wing, read_wing
 
 PARTS = ".parts"
+FORMATS = ("mat", "mcap", "netcdf")
 MODULES = ("reconstruct.stages",)  # what a worker loads before the clock starts
 BYTES_A_SECOND = 500e6  # of frames that one core works off, roughly,
 ROWS_A_SECOND = 6000.0  # and of markers
@@ -76,6 +80,7 @@ class Job:
     command: str = ""  # as it is recorded in the files
     smooth_s: float = 0.0  # correlation time of smoothing; 0: every set by itself
     reference: Reference = None  # what displacements are counted from; None: the unloaded wing
+    also: tuple[str, ...] = ("mat", "mcap")  # of FORMATS
     report: bool = True
     scheduler: str | None = None  # a Dask scheduler's address, or local; None: processes of our own
     settings: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
@@ -157,6 +162,7 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
     if not summary["converged_percent"]:
         reason = found.frames.column("reason")[0].as_py()
         raise ReconstructError(f"{source.name}: no set could be fitted ({reason}); see {job.out / FRAMES}")
+    _write_also(job, store, fitted, note)
     if job.report:
         write_report(read_result(job.out), job.out)
         end = time.monotonic()
@@ -167,12 +173,14 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
     return summary, problems
 
 
-def run_comparison(result: Path, reference: Path, folder: Path, command: str) -> Comparison:
+def run_comparison(
+    result: Path, reference: Path, folder: Path, command: str, *, from_start: bool = False, window: Window | None = None
+) -> Comparison:
     """Compare, write comparison.json and the tables of errors into ``folder``, and the report with them.
 
     Raises UsageError when a folder or table is missing or cannot be used, or nothing of the two overlaps.
     """
-    comparison = compare(result, reference)
+    comparison = compare(result, reference, from_start=from_start, window=window)
     folder.mkdir(parents=True, exist_ok=True)
     write_table(comparison.shape_errors, folder / SHAPE_ERRORS, command=command)
     write_table(comparison.marker_errors, folder / MARKER_ERRORS, command=command)
@@ -250,6 +258,15 @@ class _Source:
         return measure(self._recording, self.rig, self._job.settings, store, hands, tell)
 
 
+def _write_also(job: Job, store: PartStore, fitted: Sequence[Key], note: Mapping[str, Any]) -> None:
+    if "mcap" in job.also:
+        write_scene(store, fitted, job.out, note)
+    if "mat" in job.also:
+        write_mat(job.out)
+    if "netcdf" in job.also:
+        write_netcdf(job.out)
+
+
 def _workers(job: Job, source: _Source) -> int:
     return job.workers or max(1, min(usable_cores(), int(source.work_s / WORTH_A_WORKER_S)))
 
@@ -261,7 +278,7 @@ def _telling(progress: Progress, stage: str, flight_s: float) -> Callable[[int, 
 def _remove_stale(job: Job) -> None:
     """A run that fails half way must not leave an older one's words."""
     texts = [Path(name).with_suffix(".csv").name for name in (SHAPE, FRAMES, LOADS, RESIDUALS, MARKERS, AIR)]
-    for stale in (AIR, REPORT, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
+    for stale in (AIR, REPORT, SCENE, MAT, NETCDF, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
         (job.out / stale).unlink(missing_ok=True)
 
 

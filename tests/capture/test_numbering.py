@@ -1,6 +1,7 @@
 """Frames to triggers, against a board and a camera whose truth is known."""
 
 import random
+import time
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -95,6 +96,18 @@ def test_no_frame_is_of_a_trigger_before_the_first():
         told[earliest] = [numbered and numbered.index for k in frames for _, numbered in numbering.feed(k)]
     assert told[7][:3] == [7, 8, 9]
     assert told[0][0] == 6  # what the bound is for
+
+
+def test_frames_are_not_held_up_by_a_board_that_is_gone():
+    """One wait, not one a frame: at 50 Hz, 30 ms a frame would be more than there is."""
+    log = TriggerLog(50)
+    log.add(Pulse(0, 1, START_NS, START_NS))
+    begin_s = time.monotonic()
+    for index in range(1, 50):
+        assert log.nearest(START_NS + index * 20_000_000, 0.2)[0] == index
+    assert time.monotonic() - begin_s < 2.0  # 49 waits would be 9.8 s
+    log.add(Pulse(50, 51, START_NS + 10**9, START_NS + 10**9))
+    assert log.nearest(START_NS + 10**9, 0.2) == (50, START_NS + 10**9)
 
 
 def test_the_log_believes_no_pulse_that_goes_back():

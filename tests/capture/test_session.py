@@ -206,7 +206,7 @@ def test_a_burst_before_the_recording_is_in_nobodys_books(write_config, rig, tmp
     assert [gate.name for gate in marks(tmp_path) if gate.name.startswith("burst")] == []
 
 
-def test_a_camera_that_misses_a_trigger_of_the_burst_is_marked_and_recorded(write_config, rig, tmp_path):
+def test_a_camera_that_misses_a_trigger_of_the_burst_is_marked_and_recorded(write_config, rig, tmp_path, wingcap):
     rig.missed = {("left_cam1", 2**31 + 3)}
     _, run = record(write_config(top="[start]\nburst = 8"))
     result = run()
@@ -214,7 +214,11 @@ def test_a_camera_that_misses_a_trigger_of_the_burst_is_marked_and_recorded(writ
     (begin, end) = marks(tmp_path)
     assert (begin.name, begin.cause) == ("burst left/cam1", "the board gave 8 triggers, the camera 7 frames")
     assert end.end_ns > end.begin_ns
-    assert inspect([tmp_path]).problems == []
+    report = inspect([tmp_path])
+    assert (report.problems, list(report.marks.values())) == ([], [end])
+    said = wingcap("info", tmp_path).stdout
+    assert "marked: burst left/cam1" in said
+    assert "the board gave 8 triggers, the camera 7 frames" in " ".join(said.split())
 
 
 def test_it_waits_armed_for_the_first_trigger_of_another_hand(write_config, rig, tmp_path):

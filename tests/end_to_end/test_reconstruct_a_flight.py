@@ -5,11 +5,14 @@ import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from needs import needs_module
 from rendered_flight import true_rig, write_flight
 
 from hw_sim.demo import executable
@@ -34,7 +37,16 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def command(flight: Path, *words: object) -> list[str]:
     """Run in the folder of the result, so that the command is the same for each."""
     paths = (flight / "ssd_left", flight / "ssd_right", "--rig", flight / "rig.json", "--wing", flight / "wing.toml")
-    return [executable("reconstruct"), *map(str, paths), "-o", "out", "--no-report", *map(str, words)]
+    return [
+        executable("reconstruct"),
+        *map(str, paths),
+        "-o",
+        "out",
+        "--no-report",
+        "--no-mat",
+        "--no-mcap",
+        *map(str, words),
+    ]
 
 
 def reconstruct(flight: Path, folder: Path, *words: object) -> Path:
@@ -116,14 +128,63 @@ def test_the_number_of_workers_changes_nothing(flight, alone, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_cluster_here_changes_nothing(flight, alone, tmp_path):
+    needs_module("distributed")
+    assert_same_tables(alone, reconstruct(flight, tmp_path / "dask", "--scheduler", "local", "--workers", 2))
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A Dask scheduler and two workers, each a process of its own: its address, and the workers."""
+    needs_module("distributed")
+    contact = tmp_path / "scheduler.json"
+    common = ["--scheduler-file", str(contact), "--no-dashboard"]
+    with (tmp_path / "dask.log").open("wb") as log, ExitStack() as running:
+
+        def start(*words: str) -> subprocess.Popen[bytes]:
+            process = subprocess.Popen([executable("dask"), *words, *common], cwd=tmp_path, stdout=log, stderr=log)
+            running.callback(process.wait)
+            running.callback(process.kill)
+            return process
+
+        start("scheduler", "--port", "0", "--host", "127.0.0.1")
+        wait_until(contact.exists)
+        workers = [start("worker", "--nthreads", "1", "--no-nanny") for _ in range(2)]
+        wait_until(lambda: (tmp_path / "dask.log").read_text().count("Registered to") >= 2)
+        yield json.loads(contact.read_text())["address"], workers
+
+
+def wait_until(holds: Callable[[], bool], limit_s: float = 60.0) -> None:
+    end = time.monotonic() + limit_s
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+@pytest.mark.slow
+def test_a_worker_killed_midway_changes_nothing(flight, alone, tmp_path, cluster):
+    address, (first, _) = cluster
+    folder = tmp_path / "result"
+    folder.mkdir()
+    process = subprocess.Popen(command(flight, "--scheduler", address), cwd=folder, stderr=subprocess.PIPE, text=True)
+    parts = folder / "out/.parts"
+    wait_until(lambda: len(list(parts.glob("markers-*.part"))) >= 2 or process.poll() is not None)
+    assert process.poll() is None
+    first.kill()
+    assert process.wait(200) == 0, process.stderr and process.stderr.read()
+    if process.stderr:
+        process.stderr.close()
+    assert_same_tables(alone, folder / "out")
+
+
+@pytest.mark.slow
 def test_killed_at_any_moment_it_goes_on(flight, tmp_path):
     """Five times, at random moments of a run that takes a few seconds; the last one is left to end."""
     seed = int(time.time())
     print("seed", seed)
-    moments = np.random.default_rng(seed).uniform(0.5, 5.0, 5)
     begin = time.monotonic()
     whole = reconstruct(flight, tmp_path / "whole", "--workers", 2)
-    moments *= max(1.0, (time.monotonic() - begin) / 5.0)
+    moments = np.random.default_rng(seed).uniform(0.1, 0.6, 5) * (time.monotonic() - begin)
     killed = tmp_path / "killed"
     killed.mkdir()
     for moment in moments:

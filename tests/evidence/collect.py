@@ -66,9 +66,8 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
             "wingproc accuracy -o {target}/accuracy --calibrations 20",
         ),
         Step(
-            "centroid noise beside the Cramér-Rao bound, saturated lights, 300,000 identities",
-            "pytest -q -s -m slow tests/process/test_cramer_rao.py tests/process/test_detect.py "
-            "tests/process/test_match.py",
+            "centroid noise beside the Cramér-Rao bound, and 300,000 identities",
+            "pytest -q -s -m slow tests/process/test_detect.py tests/process/test_match.py",
         ),
         Step(
             "detection: time a frame, errors, beside SimpleBlobDetector, trackpy and photutils",

@@ -7,6 +7,14 @@ import pytest
 from vm import START_UDEV, WINGCAP, WINGSIM, VmRun, run_in_vm
 
 CAMERAS = (("left", "cam0"), ("left", "cam1"), ("right", "cam0"), ("right", "cam1"))
+CAN_SENDER = """
+import itertools, time
+import can
+with can.Bus(interface="socketcan", channel="vcan0") as bus:
+    for number in itertools.count():
+        bus.send(can.Message(arbitration_id=0x123, data=number.to_bytes(8, "little"), is_extended_id=False))
+        time.sleep(0.02)
+"""
 
 
 @pytest.fixture(scope="session")
@@ -25,6 +33,7 @@ def usb_flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[VmRun, dict]:
         'flight = "usb"\n[trigger]\nport = "trigger"\nrate_hz = 4\n'
         '[disks]\nleft = "left"\nright = "right"\nreserve_mb = 1\n'
         f'[camera]\nbackend = "aravis"\nwidth = 208\nheight = 156\nexposure_us = 2000\n{cameras}'
+        '[[can]]\nname = "bus"\ninterface = "socketcan"\nchannel = "vcan0"\n'
     )
     rig = " ".join(f"--fault {fault}" for fault in faults)
     script = f"""{START_UDEV}
@@ -36,12 +45,17 @@ mkdir left right
 until grep -q ready rig; do kill -0 $rig; sleep 0.2; done
 until [ $(cat /sys/bus/usb/devices/*/serial | grep -c ^1749) = 4 ]; do kill -0 $rig; sleep 0.2; done
 udevadm settle
+ip link add dev vcan0 type vcan; ip link set up vcan0
+python - <<'END' & sender=$!
+{CAN_SENDER}
+END
 {WINGCAP} record --config wingcap.toml --triggers 100 --json > /artifacts/record.json || echo record: $?
+kill $sender; wait $sender || true
 kill $rig; wait $rig || true
 cp rig /artifacts/rig
 cp -r left /artifacts/left; cp -r right /artifacts/right
 """
-    run = run_in_vm(script, tmp_path_factory.mktemp("usb"), ["vhci-hcd"], timeout_s=200)
+    run = run_in_vm(script, tmp_path_factory.mktemp("usb"), ["vhci-hcd", "vcan"], timeout_s=200)
     return run, json.loads((run.artifacts / "record.json").read_text())
 
 

@@ -1,10 +1,13 @@
-"""USB3 Vision through kernel, udev, libusb and Aravis into a recording, while things happen to the cameras."""
+"""USB3 Vision through kernel, udev, libusb and Aravis into a recording, while things happen to the cameras.
+
+Beside it a CAN bus of the kernel's own (vcan), on which numbered frames go by.
+"""
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from capture.record import Frame, decode_image
+from capture.record import CAN_TOPIC, CanFrame, Frame, decode_image
 from capture.verify import inspect
 
 pytestmark = pytest.mark.slow
@@ -86,3 +89,17 @@ def test_the_hardware_counts_the_same(usb_flight, report):
     assert counts[LOSING] == {"exposed": TRIGGERS, "sent": TRIGGERS - 1, "lost": 1, "overflowed": 0}
     assert counts[HELD] == {"exposed": TRIGGERS, "sent": TRIGGERS - 2, "lost": 0, "overflowed": 2}
     assert counts[PULLED]["sent"] == report.cameras[PULLED].recorded
+
+
+def test_every_can_frame_of_the_flight_is_there_in_order(usb_folders):
+    for folder in usb_folders:
+        frames = []
+        with (folder / "aux_0000.mcap").open("rb") as file:
+            for _, _, message in make_reader(file, validate_crcs=True).iter_messages(topics=[CAN_TOPIC]):
+                frames.append(CanFrame.decode(message.data))
+        numbers = [int.from_bytes(frame.data, "little") for frame in frames]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert len(numbers) > 100
+        assert {(frame.bus, frame.id) for frame in frames} == {("bus", 0x123)}
+        times = [frame.stamp_ns for frame in frames]
+        assert times == sorted(times)

@@ -75,6 +75,8 @@ def test_files_of_a_run(out: Path, table: Path, wing_file: Path) -> None:
     tables = {"markers", "shape", "frames", "loads", "residuals"}
     assert names == {f"{name}.{kind}" for name in tables for kind in ("parquet", "csv")} | {
         "unloaded.parquet",
+        "result.mat",
+        "wing.mcap",
         "summary.json",
         "report.html",
         "figures",

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from capture.errors import UsageError
+from process.reference import Window
 from reconstruct.compare import compare, interpolate_shape
 from reconstruct.tables import shape_series
 
@@ -160,3 +161,37 @@ def test_a_reference_of_one_set(shifted: Path, bending_wing: Any, tmp_path: Path
 def test_a_folder_that_is_not_there(tmp_path: Path, reference: Path) -> None:
     with pytest.raises(UsageError, match="no such folder"):
         compare(tmp_path / "nothing", reference)
+
+
+def test_displacements_from_a_window_do_not_have_what_is_always_off(shifted: Path, reference: Path) -> None:
+    found = compare(shifted, reference, window=Window(0.0, 0.5)).summary
+    assert found["displacement_rms_mm"] < 0.01
+    assert found["displacement_twist_rms_deg"] < 1e-3
+    assert "displacement_rms_mm" not in compare(shifted, reference).summary
+    with pytest.raises(UsageError, match="--reference-window 50:60: no set of the left wing"):
+        compare(shifted, reference, window=Window(50.0, 60.0))
+
+
+def test_a_simulation_has_shapes_only_and_a_time_of_its_own(
+    bending_wing: Any, frame_times: np.ndarray, tmp_path: Path
+) -> None:
+    result = write_result(tmp_path / "result", bending_wing(shift_m=SHIFT_M), frame_times)
+    simulated = bending_wing().reference(tmp_path / "simulated", frame_times[0] + np.arange(0.0, 2.3, 0.011))
+    (simulated / "markers.parquet").unlink()
+    table = pq.read_table(simulated / "shape.parquet")
+    own_ns = np.asarray(table.column("timestamp_ns"))
+    place = table.column_names.index("timestamp_ns")
+    table = table.set_column(place, "timestamp_ns", pa.array(own_ns - own_ns.min()))
+    pq.write_table(table, simulated / "shape.parquet")
+    with pytest.raises(UsageError, match="--from-start"):
+        compare(result, simulated)
+    found = compare(result, simulated, from_start=True).summary
+    assert found["shape_rms_mm"] == pytest.approx(3.0, abs=0.01)
+    assert found["markers_compared"] == 0
+    assert found["marker_rms_mm"] is None
+
+
+def test_arguments_in_the_wrong_order_are_told_so(shifted: Path, reference: Path) -> None:
+    (shifted / "frames.parquet").touch()  # what a truth does not have
+    with pytest.raises(UsageError, match=r"is no result of `reconstruct run`, .* is one: the result comes first"):
+        compare(reference, shifted)
