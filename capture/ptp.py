@@ -88,7 +88,10 @@ class PtpSocket:
     def subscribe(self) -> bool:
         """Ask to be told of events for SUBSCRIBED_S; False when this ptp4l does not do that."""
         data = encode_subscription((NOTIFY_PORT_STATE, NOTIFY_TIME_SYNC), SUBSCRIBED_S)
-        return not self._ask(Action.SET, Id.SUBSCRIBE_EVENTS_NP, data)[0].refused
+        try:
+            return not self._ask(Action.SET, Id.SUBSCRIBE_EVENTS_NP, data)[0].refused
+        except NotManagement as error:
+            raise self._senseless(error) from error
 
     def drain(self) -> None:
         """Forget what was told: the caller asks for everything anyway."""
@@ -107,13 +110,17 @@ class PtpSocket:
             ports = self._ask(Action.GET, Id.PORT_DATA_SET, answers=number_of_ports(default))
             return decode_status(default, current, parent, properties, status, [port.data for port in ports])
         except NotManagement as error:
-            raise PtpError(f"{self._server}: ptp4l's answer makes no sense ({error}): check its version") from error
+            raise self._senseless(error) from error
+
+    def _senseless(self, error: NotManagement) -> PtpError:
+        return PtpError(f"{self._server}: ptp4l's answer makes no sense ({error}): check its version")
 
     def _ask(self, action: Action, id: Id, data: bytes = b"", answers: int = 1) -> list[Reply]:
         self._sequence = self._sequence % 0xFFFF + 1
         found: list[Reply] = []
         try:
-            self._socket.send(encode_request(action, id, self._sequence, self._domain, data))
+            # Not to be waited for: a ptp4l that hangs takes nothing from its socket, which is soon full.
+            self._socket.send(encode_request(action, id, self._sequence, self._domain, data), socket.MSG_DONTWAIT)
             for _ in range(64):
                 if len(found) == answers:
                     return found

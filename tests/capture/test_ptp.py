@@ -1,14 +1,19 @@
 """What ptp4l says to gates and an uncertainty, from made-up answers; the bytes, against linuxptp's own layout."""
 
+import contextlib
 import dataclasses
 import math
+import socket
 import struct
+import threading
 from pathlib import Path
 
 import pytest
 
-from capture import phc
+from capture import phc, ptp
+from capture.clock import SystemClock
 from capture.config import PtpConfig
+from capture.errors import PtpError
 from capture.ptp_judge import HOLDOVER_PPM, SETTLE_S, PtpJudge
 from capture.ptp_protocol import (
     Action,
@@ -156,3 +161,30 @@ def test_a_message_that_ends_early_is_refused(cut):
 
 def test_an_identity_reads_as_linuxptp_writes_it():
     assert identity_text(0xF6A30AFFFE0232CA) == "f6a30a.fffe.0232ca"
+
+
+def test_a_ptp4l_that_hangs_holds_up_neither_the_watch_nor_its_end(tmp_path, monkeypatch):
+    """It takes nothing from its socket any more, which is full after a few questions."""
+    monkeypatch.setattr(ptp, "REPLY_TIMEOUT_S", 0.01)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as hung:
+        hung.bind(str(tmp_path / "ptp4l"))
+        watch = ptp.PtpWatch(PtpConfig(role="slave", socket=tmp_path / "ptp4l"), SystemClock())
+        asking = threading.Thread(target=lambda: [watch.step() for _ in range(600)], daemon=True)
+        asking.start()
+        asking.join(60)
+        assert not asking.is_alive()
+    assert watch.account() == {"ptp_asked": "600", "ptp_unanswered": "600"}
+
+
+def test_an_answer_that_makes_no_sense_is_one_line_whenever_it_comes(tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
+        server.bind(str(tmp_path / "ptp4l"))
+
+        def answer() -> None:
+            _, client = server.recvfrom(1500)
+            server.sendto(b"nonsense", client)
+
+        threading.Thread(target=answer).start()
+        connection = ptp.PtpSocket(tmp_path / "ptp4l", 0)
+        with contextlib.closing(connection), pytest.raises(PtpError, match="makes no sense"):
+            connection.subscribe()
