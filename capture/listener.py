@@ -120,8 +120,8 @@ class Listener:
     def _open(self) -> bool:
         try:
             self._link = self._connect()
-        except LinkError as error:
-            self._is_gone(str(error))
+        except Exception as error:  # as below: it is tried again
+            self._is_gone(self._why(error))
             return False
         self._heard_s = self._clock.monotonic_s()
         return True
@@ -130,7 +130,7 @@ class Listener:
         try:
             heard = link.hear(READ_S)
         except Exception as error:  # drivers raise what they like; whatever it is, the link is opened anew
-            self._is_gone(str(error) if isinstance(error, LinkError) else f"{self.name}: {error!r}")
+            self._is_gone(self._why(error))
             self._close()
             return False
         self._sound = True
@@ -145,6 +145,9 @@ class Listener:
             self._heard_s = self._clock.monotonic_s()
         return True
 
+    def _why(self, error: Exception) -> str:
+        return str(error) if isinstance(error, LinkError) else f"{self.name}: {error!r}"
+
     def _is_gone(self, why: str) -> None:
         self._sound = False
         self._trouble = why
@@ -154,11 +157,11 @@ class Listener:
         link, self._link = self._link, None
         if link is None:
             return
-        self._lost += link.lost
         try:
             link.close()
         except Exception as error:  # the device is gone already
             self._trouble = self._trouble or repr(error)
+        self._lost += link.lost  # with what it counted last
 
     def _book_outage(self) -> None:
         """One that has gone on until now, if one has."""

@@ -211,6 +211,35 @@ def test_whatever_a_driver_raises_the_link_is_opened_anew():
     assert "firmware bug" in listener.statuses()[0].message
 
 
+def test_whatever_opening_raises_it_is_tried_again():
+    attempts = []
+
+    def connect() -> object:
+        attempts.append(1)
+        raise KeyError("bitrate")
+
+    with listening("odd", connect) as (listener, _):
+        wait_until(lambda: len(attempts) > 1, "tried again")
+    assert "bitrate" in listener.statuses()[0].message
+
+
+def test_what_a_link_counts_when_it_is_closed_is_in_the_account():
+    class Counting:
+        def __init__(self) -> None:
+            self.lost: Counter[str] = Counter()
+
+        def hear(self, wait_s: float) -> tuple[Heard, ...]:
+            time.sleep(wait_s)
+            return ()
+
+        def close(self) -> None:
+            self.lost["socket full"] = 7
+
+    with listening("bus", Counting) as (listener, _):
+        wait_until(lambda: listener.statuses()[0].level < 2, "opened")
+    assert json.loads(listener.account()["bus.lost"]) == {"socket full": 7}
+
+
 def test_after_stop_nothing_is_put():
     release = threading.Event()
 
