@@ -202,10 +202,8 @@ def write_health(folder: Path, health: Health) -> None:
     text = json.dumps(health.as_dict(), allow_nan=False)
     beside = folder / f".{HEALTH_FILE}.{os.getpid()}"
     descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-    try:
-        os.write(descriptor, text.encode())
-    finally:
-        os.close(descriptor)
+    with os.fdopen(descriptor, "wb") as file:  # all of it, or an error: a full tmpfs takes a part
+        file.write(text.encode())
     beside.replace(folder / HEALTH_FILE)
 
 

@@ -84,7 +84,7 @@ class HealthWriter(Worker):
         try:
             make_folder(self.folder)
             write_health(self.folder, self._complete(self.source()))
-        except (CaptureError, OSError) as error:
+        except Exception as error:  # a snapshot that fails is one that is missing
             self._complain(error)
 
     def _complete(self, health: Health) -> Health:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import resource
 import threading
 import time
 from collections.abc import Callable
@@ -246,6 +247,38 @@ def test_what_is_no_health_is_refused_with_its_name(tmp_path, text):
     (tmp_path / HEALTH_FILE).write_text(text)
     with pytest.raises(CaptureError, match=str(tmp_path)):
         read_health(tmp_path)
+
+
+def test_a_full_tmpfs_keeps_the_last_whole_snapshot(tmp_path):
+    """A file that may not grow past 4096 bytes takes a part of a write, as a full tmpfs does."""
+    write_health(tmp_path, blank())
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with pytest.raises(OSError, match="large"):
+            write_health(tmp_path, blank(failures=("x" * 5000,)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert read_health(tmp_path) == blank()
+
+
+def test_a_snapshot_that_fails_is_not_the_last(tmp_path, write_config, rig):
+    said: list[str] = []
+    writer = HealthWriter(load_config(write_config(top="health.folder = 'health'")).config, SystemClock(), said.append)
+    bad = [ZeroDivisionError("a defect")]
+
+    def source() -> Health:
+        if bad:
+            raise bad.pop()
+        return blank()
+
+    writer.source = source
+    with writer:
+        end_s = time.monotonic() + DEADLINE_S
+        while read_health(writer.folder) is None and time.monotonic() < end_s:
+            time.sleep(0.05)
+    assert read_health(writer.folder) is not None
+    assert "a defect" in said[0]
 
 
 def test_no_health_yet_is_no_error(tmp_path):
