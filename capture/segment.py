@@ -210,7 +210,6 @@ class SegmentWriter:
                 publish_time=message.publish_ns,
                 data=message.data,
             ).write(body)
-            self.message_counts[message.channel] += 1
         content = body.end()
         first, last = min(m.log_ns for m in messages), max(m.log_ns for m in messages)
         out = RecordBuilder()
@@ -230,6 +229,8 @@ class SegmentWriter:
         index_length = out.count - chunk_length
         self._write_block(out.end())
         self._index_chunk(first, last, base, chunk_length, index_at, index_length, len(content))
+        for channel, entries in index.items():
+            self.message_counts[channel] += len(entries)
 
     def write_metadata(self, name: str, values: dict[str, str]) -> None:
         """Write a Metadata record, outside chunks."""

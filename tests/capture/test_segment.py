@@ -16,7 +16,7 @@ from capture.errors import DiskError
 from capture.record import Frame, image_prefix
 from capture.recorder import camera_channels
 from capture.ring import PAGE, Ring
-from capture.segment import FrameLayout, SegmentWriter
+from capture.segment import FrameLayout, SegmentWriter, SmallMessage
 
 
 def frame_of(index: int) -> Frame:
@@ -104,3 +104,16 @@ def test_the_ring_hands_out_each_slot_once():
     assert address % PAGE == 0
     with pytest.raises(ValueError, match="whole pages"):
         Ring(3, 100, lock_memory=False)
+
+
+def test_messages_of_a_refused_batch_are_not_counted(tmp_path, monkeypatch):
+    writer = SegmentWriter(SystemDisk(), tmp_path / "left_0000.mcap", camera_channels(["cam0"], "left"), {}, "buffered")
+    batch = [SmallMessage(2, number, 5, 5, b"x") for number in range(3)]
+    with monkeypatch.context() as patch:
+        patch.setattr("capture.disk.PlainFile.write", lambda file, data: os.fsync(1 << 20))
+        with pytest.raises(DiskError):
+            writer.write_batch(batch)
+    writer.write_batch(batch)
+    writer.close()
+    with (tmp_path / "left_0000.mcap").open("rb") as file:
+        assert SeekingReader(file).get_summary().statistics.message_count == 3
