@@ -9,6 +9,8 @@ from capture.clock import EARLIEST_NS, Clock
 from capture.clock_fit import ClockFigures
 from capture.record import GATE_TOPIC, Diagnostic, Gate
 
+EARLY_PERIODS = 0.25  # more than board and computer may disagree by, less than a frame numbered one too high does
+
 
 @dataclass(frozen=True)
 class _Open:
@@ -81,10 +83,25 @@ def judge_clock(gates: Gates, clock: Clock) -> None:
     gates.judge("clock", None if clock.utc_ns() >= EARLIEST_NS else "the computer's clock was never set: it says 1970")
 
 
-def judge_cameras(gates: Gates, clocks: Mapping[str, ClockFigures], limit_us: float) -> None:
-    """Each camera's instants are known within the limit; ``clocks`` by ``side/name``."""
+def judge_cameras(gates: Gates, clocks: Mapping[str, ClockFigures], limit_us: float, period_us: float) -> None:
+    """Each camera's instants are known within the limit, and no frame comes before its exposure can have ended.
+
+    The latter is what frames do that are numbered too high: a camera's first ones were all late by more than a period.
+
+    Args:
+        gates: where it is marked.
+        clocks: by ``side/name``.
+        limit_us: one sigma.
+        period_us: from trigger to trigger.
+    """
     for name, figures in clocks.items():
         sigma_us = figures.sigma_ns * 1e-3
         wide = figures.frames > 0 and sigma_us > limit_us
         cause = f"its frames' instants are known to {sigma_us:.0f} us only, not {limit_us:g} us"
         gates.judge(f"clock {name}", cause if wide else None)
+        early = figures.floor_us < -EARLY_PERIODS * period_us  # False while the floor is not known
+        cause = (
+            f"its frames come {-figures.floor_us * 1e-3:.1f} ms before their exposure can have ended: they may be "
+            "numbered too high, or the clocks of trigger board and computer disagree"
+        )
+        gates.judge(f"numbering {name}", cause if early else None)

@@ -11,6 +11,10 @@ FIRST_REPORT_WAIT_S = 0.2
 """The same for a camera's first frame, which nothing but the report can number. The driver's buffers bridge it."""
 
 
+LEAP_NS = 10_000_000_000
+"""What a device's clock may pass between two frames without the computer's clock having noticed."""
+
+
 class Triggers(Protocol):
     """Which trigger was given when; capture.trigger.TriggerLog in a flight."""
 
@@ -44,8 +48,8 @@ class FrameNumbering:
     before its exposure can have begun, or, when it was delivered late, to an earlier one; so the earliest of what
     they say about the first frame is believed. From then on the *device's* clock says how many periods have passed
     since the last frame (host time is late when the host is busy, the device's is not), and its frame counter says
-    how many of the skipped triggers were exposed. A device whose clock jumps is noticed by frames that fit no trigger:
-    after ``CONFIRMING`` of them in a row it is begun with anew.
+    how many of the skipped triggers were exposed. A device whose clock jumps is noticed by frames that fit no trigger,
+    or come long before the time that it says has passed: after ``CONFIRMING`` of them in a row it is begun with anew.
     """
 
     def __init__(self, camera: CameraDescription, triggers: Triggers, earliest_index: int = 0) -> None:
@@ -70,14 +74,24 @@ class FrameNumbering:
                 self._last, self._strays = None, 0
             return [(grab, numbered)]
         self._held.append(grab)
-        return self.flush() if len(self._held) >= CONFIRMING else []
+        return self._settle() if len(self._held) >= CONFIRMING else []
 
     def flush(self) -> list[tuple[Grab, Numbered | None]]:
-        """Number what is held back, because there is enough of it or because no more will come."""
-        held, self._held = self._held, []
-        first = self._first(held)
+        """Number what is held back, because no more will come."""
+        told: list[tuple[Grab, Numbered | None]] = []
+        while self._held:
+            told += self._settle()
+        return told
+
+    def _settle(self) -> list[tuple[Grab, Numbered | None]]:
+        """Number what is held back. When the first of it is none of a trigger's, only that one is told.
+
+        Those after it may be: the camera was armed while somebody else's triggers were still coming.
+        """
+        first = self._first(self._held)
         if first is None:
-            return [(grab, None) for grab in held]
+            return [(self._held.pop(0), None)]
+        held, self._held = self._held, []
         self._last = (held[0], first)
         return [(held[0], first), *(told for grab in held[1:] for told in self.feed(grab))]
 
@@ -98,6 +112,8 @@ class FrameNumbering:
         last_grab, before = last
         steps = (grab.frame_id - last_grab.frame_id) % (1 << self._camera.frame_id_bits)
         passed_ns = self._device_ns(grab.device_ticks - last_grab.device_ticks)
+        if passed_ns > LEAP_NS and grab.receive_ns - last_grab.receive_ns < passed_ns // 2:
+            return None  # no time that passed: its clock was set
         found = self._triggers.nearest(before.trigger_ns + passed_ns, REPORT_WAIT_S)
         if steps == 0 or found is None or found[0] <= before.index:
             return None

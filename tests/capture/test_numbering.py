@@ -3,11 +3,16 @@
 import random
 import time
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from capture.camera.base import CameraDescription, FrameStatus, Grab
+from capture.clock import SystemClock
+from capture.frame_clock import FrameClock
+from capture.gates import Gates, judge_cameras
 from capture.numbering import CONFIRMING, FrameNumbering
+from capture.ptp import FREE_RUNNING
 from capture.trigger import TriggerLog
 from capture.trigger_protocol import Pulse
 
@@ -98,6 +103,18 @@ def test_no_frame_is_of_a_trigger_before_the_first():
     assert told[0][0] == 6  # what the bound is for
 
 
+def test_frames_of_another_hands_triggers_do_not_take_ours_with_them():
+    """The camera was armed while the board still gave triggers that were none of this recording's."""
+    log, told = TriggerLog(25), []
+    for index in range(10):
+        log.add(Pulse(index, index, START_NS + index * PERIOD_NS, START_NS + index * PERIOD_NS))
+    numbering = FrameNumbering(CAMERA, log)
+    for k in range(-3, 10):  # before 0: not reported to us
+        receive_ns = START_NS + k * PERIOD_NS + EXPOSURE_US * 1000 + ROW_NS * HEIGHT + 1_000_000
+        told += numbering.feed(Grab(0, 5 + k, k * PERIOD_NS, receive_ns, EXPOSURE_US, 0.0, FrameStatus.COMPLETE))
+    assert [numbered and numbered.index for _, numbered in told] == [None, None, None, *range(10)]
+
+
 def test_frames_are_not_held_up_by_a_board_that_is_gone():
     """One wait, not one a frame: at 50 Hz, 30 ms a frame would be more than there is."""
     log = TriggerLog(50)
@@ -116,3 +133,40 @@ def test_the_log_believes_no_pulse_that_goes_back():
         log.add(Pulse(index, 1, time_ns, time_ns))
     assert log.nearest(1_000_000_300, 0.0) == (5, 1_000_000_000)
     assert log.nearest(1_000_000_000 + 3 * PERIOD_NS, 0.0) == (8, 1_000_000_000 + 3 * PERIOD_NS)
+
+
+def test_a_clock_that_is_set_years_ahead_costs_a_few_frames_and_no_wrong_one():
+    """A network camera that has found its PTP master: its clock goes from time since power-up to time since 1970."""
+    log = TriggerLog(25)
+    for index in range(40):
+        log.add(Pulse(index, index, START_NS + index * PERIOD_NS, START_NS + index * PERIOD_NS))
+    numbering, told = FrameNumbering(CAMERA, log), []
+    for index in range(40):
+        ticks = index * PERIOD_NS + (START_NS if index >= 10 else 0)
+        receive_ns = START_NS + index * PERIOD_NS + EXPOSURE_US * 1000 + ROW_NS * HEIGHT + 1_000_000
+        told += numbering.feed(Grab(0, index, ticks, receive_ns, EXPOSURE_US, 0.0, FrameStatus.COMPLETE))
+    numbers = [(grab.frame_id, numbered and numbered.index) for grab, numbered in told]
+    assert numbers == [(k, None if 10 <= k < 10 + CONFIRMING else k) for k in range(40)]
+
+
+@pytest.mark.parametrize(("late_ns", "marked"), [(PERIOD_NS + 3_000_000, True), (3_000_000, False)])
+def test_frames_numbered_too_high_are_marked_once_the_computer_is_less_busy(late_ns, marked):
+    """The first frames are all late by more than a period, so every frame counts from one too high."""
+    log, seen = TriggerLog(25), {}
+    for index in range(120):
+        log.add(Pulse(index, index, START_NS + index * PERIOD_NS, START_NS + index * PERIOD_NS))
+    numbering, clock = FrameNumbering(CAMERA, log), FrameClock(CAMERA, log, lambda: FREE_RUNNING, 0)
+    for k in range(100):
+        receive_ns = START_NS + k * PERIOD_NS + EXPOSURE_US * 1000 + ROW_NS * HEIGHT
+        receive_ns += late_ns if k < CONFIRMING else 3_000_000
+        for grab, numbered in numbering.feed(
+            Grab(0, k, k * PERIOD_NS, receive_ns, EXPOSURE_US, 0.0, FrameStatus.COMPLETE)
+        ):
+            seen[grab.frame_id] = numbered.index
+            clock.time_of(grab, numbered)
+    assert seen == {k: k + marked for k in range(100)}
+    gates = Gates(SystemClock())
+    judge_cameras(gates, {"left/cam0": clock.figures}, 100.0, PERIOD_NS * 1e-3)
+    assert list(gates.failing) == (["numbering left/cam0"] if marked else [])
+    if marked:
+        assert "come 37.0 ms before their exposure can have ended" in gates.failing["numbering left/cam0"]
