@@ -203,6 +203,7 @@ def _run_threaded(case: BenchCase, folder: Path, disk: Disk, progress: Callable[
     ledger, lanes, cameras = _lanes(case, folder, disk, clock)
     cpu_s, begin_s = time.process_time(), time.monotonic()
     for lane in lanes:
+        lane.start_writing()
         lane.start()
     depth: list[tuple[float, int]] = []
     while not all(camera.finished for camera in cameras) and not _broken(lanes):
@@ -311,6 +312,7 @@ def _ceiling_ours(case: BenchCase, folder: Path) -> float:
             camera.follow(grabber.ring, beside)
     begin_s = time.monotonic()
     for lane in lanes:
+        lane.start_writing()
         lane.start()
     while not all(a.recorded + a.lost_total >= case.frames for a in ledger.accounts().values()):
         clock.sleep(0.002)

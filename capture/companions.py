@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+from collections.abc import Iterator
 from functools import partial
 
 from capture.aux_log import Companion
@@ -24,3 +25,12 @@ def make_companions(config: Config, clock: Clock) -> list[Companion]:
             importlib.import_module(DIALECT)  # large: loaded now, and not while the first frames come
         companions.append(Listener("mavlink", partial(MavlinkLink, config.mavlink, clock), clock))
     return companions
+
+
+@contextlib.contextmanager
+def defect_booked(companion: object, failures: list[str]) -> Iterator[None]:
+    """A companion's defect is one of the recording's ``failures``, and does not end it."""
+    try:
+        yield
+    except Exception as error:
+        failures.append(f"{type(companion).__name__}: {error!r}")

@@ -66,7 +66,7 @@ class ControlServer(Worker):
     def _answer(self, line: bytes) -> Answer:
         try:
             asked = json.loads(line)["do"]
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             asked = None
         if asked not in ACTIONS:
             return Answer(False, "", "", f'not understood: send {{"do": …}} with one of {", ".join(ACTIONS)}')

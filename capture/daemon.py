@@ -15,6 +15,7 @@ from capture.burst import give_burst, judge_burst
 from capture.camera.base import Camera, CameraDescription
 from capture.camera_place import camera_at, expected_at, open_at
 from capture.clock import Clock
+from capture.companions import defect_booked
 from capture.config import Config, LoadedConfig, driver_buffers
 from capture.disk import Disk
 from capture.errors import CameraError, DiskError
@@ -167,8 +168,11 @@ class Recording:
             self._step()
             started_s = self._clock.monotonic_s()
             try:
+                for lane in self._lanes.values():
+                    lane.start_writing()
                 for companion in self._companions:
-                    companion.start(self._aux.put)
+                    with defect_booked(companion, self._failures):
+                        companion.start(self._aux.put)
                 if self._analog is not None:
                     self._analog.begin(run.board)
                 if self._may_begin(run, stop):
@@ -184,7 +188,8 @@ class Recording:
             count = run.end()
             self._failures += [run.trouble] if run.trouble else []
             for companion in self._companions:
-                companion.stop()
+                with defect_booked(companion, self._failures):
+                    companion.stop()
             seconds = self._clock.monotonic_s() - started_s
             return self._finish(count, seconds, run)
 
@@ -397,7 +402,8 @@ class Recording:
         self._ledger.settle("the write thread ended before it came to this frame")
         end = {**run.account(count), "aux_dropped": json.dumps(self._aux.dropped)}
         for companion in self._companions:
-            end |= companion.account()
+            with defect_booked(companion, self._failures):
+                end |= companion.account()
         last = self._aux.take()  # booked while the write threads ended
         for recorder in self._recorders.values():
             if recorder.running:  # hung in a write: its files stay as they are, for `wingcap recover`
@@ -475,7 +481,7 @@ class Recording:
     def _report(self) -> None:
         judge_clock(self._gates, self._clock)
         clocks = {"/".join(place): grabber.clock for place, grabber in self._grabbers.items()}
-        judge_cameras(self._gates, clocks, self._config.camera.time_sigma_limit_us)
+        judge_cameras(self._gates, clocks, self._config.camera.time_sigma_limit_us, 1e6 / self._config.trigger.rate_hz)
         health = self._vitals.snapshot()
         statuses = tuple(Diagnostic(n.level, n.name, n.message, tuple(n.values.items())) for n in health.diagnostics)
         self._aux.diagnostics(statuses)

@@ -128,6 +128,7 @@ class Grabber(Worker):
         self._slots: set[int] = set()  # in the driver's hands, or kept for it while there is no camera
         self._not_exposed = NOT_EXPOSED  # why, up to the next frame
         self._last_index = -1
+        self._refusal: CameraError | None = None  # of a buffer: told when the frames at hand are safe
         self._asked_s = -TEMPERATURE_PERIOD_S
 
     @property
@@ -169,7 +170,7 @@ class Grabber(Worker):
                 try:
                     self.step(GRAB_TIMEOUT_S)
                     self._take_temperature()
-                except CameraLost as error:
+                except CameraError as error:  # also one that is there, but whose driver will not go on
                     self.lose(error)
         finally:
             self.finish()
@@ -181,7 +182,7 @@ class Grabber(Worker):
         """The camera is not there from the beginning: it is looked for as one that goes. Instead of ``arm``."""
         self._go(f"{error}; it was not there at the start")
 
-    def lose(self, error: CameraLost) -> None:
+    def lose(self, error: CameraError) -> None:
         """The camera is gone: take what it had delivered; from here on its triggers are lost."""
         self._flush()
         last = f"its last frame was of trigger {self._last_index}" if self._last_index >= 0 else "it gave no frame"
@@ -193,6 +194,7 @@ class Grabber(Worker):
         self.absences.append(Absence(self._parts.clock.utc_ns(), 0, cause))
         self._parts.judge(self._gate_name, cause)
         self._ledger.absent(self.place, cause)
+        self._refusal = None  # its cause is known
 
     def seek(self) -> bool:
         """Book the triggers that went by, and try once to have the camera back; whether it is."""
@@ -225,6 +227,9 @@ class Grabber(Worker):
 
     def step(self, timeout_s: float) -> bool:
         """Take one frame on its way, when there is one within ``timeout_s``."""
+        refusal, self._refusal = self._refusal, None
+        if refusal is not None:
+            raise refusal
         grab = self._camera.grab(timeout_s)
         if grab is None:
             return False
@@ -248,7 +253,7 @@ class Grabber(Worker):
             self.place, numbered.index, numbered.lost_in_delivery, self._not_exposed
         ):
             self.discarded += 1
-            self._queue(grab.slot)
+            self._requeue(grab.slot)
             return
         self._not_exposed, self._last_index = NOT_EXPOSED, numbered.index
         if grab.status is not FrameStatus.COMPLETE:
@@ -259,7 +264,7 @@ class Grabber(Worker):
         if fresh is None:
             self._lose(grab, numbered, LossStage.RING, "ring full: the disk is behind by more than ring.stall_s")
             return
-        self._queue(fresh)
+        self._requeue(fresh)
         self._hand_over(grab, numbered)
 
     def _hand_over(self, grab: Grab, numbered: Numbered) -> None:
@@ -287,7 +292,7 @@ class Grabber(Worker):
 
     def _lose(self, grab: Grab, numbered: Numbered, stage: LossStage, cause: str) -> None:
         self._ledger.lost(self.place, numbered.index, stage, cause)
-        self._queue(grab.slot)
+        self._requeue(grab.slot)
 
     def _aligned(self, description: CameraDescription) -> tuple[FrameNumbering, FrameClock]:
         """A camera's counter and clock, of which nothing is known yet."""
@@ -304,6 +309,12 @@ class Grabber(Worker):
         if now_s - self._asked_s >= TEMPERATURE_PERIOD_S:
             self._asked_s = now_s
             self.temperature_c = self._camera.temperature_c()
+
+    def _requeue(self, slot: int) -> None:
+        try:
+            self._queue(slot)
+        except CameraError as error:
+            self._refusal = error
 
     def _queue(self, slot: int) -> None:
         self._slots.add(slot)

@@ -7,6 +7,7 @@ from pathlib import Path
 from capture.camera.base import Camera, CameraDescription
 from capture.config import DiskConfig, ThreadsConfig
 from capture.disk import Disk
+from capture.errors import CameraLost
 from capture.grabber import Grabber, ReadParts, SideGate
 from capture.record import frame_topic, image_topic
 from capture.recorder import Recorder, camera_channels
@@ -35,12 +36,22 @@ class Lane:
     recorder: Recorder
     grabbers: dict[str, Grabber]  # by camera name
 
-    def start(self) -> None:
-        """Start the write thread, arm the cameras, start the read threads."""
+    def start_writing(self) -> None:
+        """Start the write thread, which takes small messages from then on."""
         self.recorder.start()
+
+    def start(self) -> None:
+        """Arm the cameras and start the read threads. A camera that went since it was opened is looked for.
+
+        Raises:
+            CameraError: a camera that is there cannot be armed.
+        """
         for grabber in self.grabbers.values():
-            if not grabber.is_absent:
-                grabber.arm()
+            try:
+                if not grabber.is_absent:
+                    grabber.arm()
+            except CameraLost as error:
+                grabber.lose(error)
             grabber.start()
 
 

@@ -1,6 +1,7 @@
 """The write thread of one disk: sealed frames and aux batches to segments, with rotation and a guard of free space."""
 
 import queue
+import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -125,6 +126,7 @@ class Recorder(Worker):
         self._calibration = calibration
         self._spare = spare
         self._queue: queue.Queue[FrameItem | AuxItem] = queue.Queue(queue_bound + AUX_QUEUE)
+        self._aux_room = threading.Semaphore(AUX_QUEUE)  # of the queue: the rest of it is the frames'
         self._segment_started_s = 0.0
         self._current: SegmentWriter | None = None
         self._synced_s = clock.monotonic_s()
@@ -139,9 +141,9 @@ class Recorder(Worker):
 
     def put_aux(self, messages: tuple[SmallMessage, ...]) -> None:
         """Hand small messages over; counted as dropped when the disk has been stuck for very long."""
-        try:
+        if self._aux_room.acquire(blocking=False):
             self._queue.put_nowait(AuxItem(messages))
-        except queue.Full:
+        else:
             self.aux_dropped += len(messages)
 
     @property
@@ -163,6 +165,7 @@ class Recorder(Worker):
         if isinstance(item, FrameItem):
             self._take_frame(item)
         else:
+            self._aux_room.release()
             self._take_aux(item)
         return True
 

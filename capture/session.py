@@ -108,9 +108,9 @@ class Session:
         self._stop = threading.Event()
         if self._quit.is_set():  # it came just before
             self._stop.set()
-        self._wanted.clear()
         current = self._make()
         self._current = current
+        self._wanted.clear()  # a start that came meanwhile meant this one
         self._tell(f"recording {current.flight}")
         try:
             result = current.run(StopRule(self._stop, triggers, duration_s))

@@ -1,6 +1,7 @@
 """The recorder end to end on a rig of fakes: what was shown is in the files, what was lost is booked, byte for byte."""
 
 import errno
+import queue
 import threading
 import time
 from pathlib import Path
@@ -12,11 +13,16 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from capture.clock import SystemClock
-from capture.config import load_config
+from capture.config import DiskConfig, load_config
 from capture.daemon import Recording, RecordingResult, StopRule
 from capture.disk import SystemDisk
 from capture.errors import CameraError, TriggerBoardError, UsageError
+from capture.grabber import Grabber
+from capture.ledger import Ledger
+from capture.recorder import AUX_QUEUE, FrameItem, Recorder
 from capture.recover import recover_flight
+from capture.ring import PAGE, Ring
+from capture.segment import SmallMessage
 from capture.trigger import TriggerBoard
 from capture.verify import inspect
 
@@ -104,6 +110,51 @@ def test_an_unplugged_camera_leaves_the_others_without_a_gap(write_config, rig, 
     report = inspect([tmp_path])
     assert report.problems == []
     assert set(report.cameras["right/cam1"].lost_indices) == set(range(10, TRIGGERS))
+
+
+def test_a_driver_that_refuses_a_buffer_is_begun_with_anew(write_config, rig, tmp_path, pixels_of, monkeypatch):
+    real, calls = Grabber._queue, []
+
+    def queue_slot(self, slot):
+        if self.place != ("right", "cam1"):
+            return real(self, slot)
+        calls.append(slot)
+        if len(calls) == 60:
+            camera = rig.cameras["right_cam1"]
+            camera._armed, camera._buffers, camera._done = False, queue.SimpleQueue(), queue.SimpleQueue()
+            raise CameraError("the driver refuses a buffer")
+        return real(self, slot)
+
+    monkeypatch.setattr(Grabber, "_queue", queue_slot)
+    result = record(write_config(), triggers=150)
+    assert result.failures == []
+    accounts = {"/".join(place): account for place, account in result.accounts.items()}
+    came_back = accounts.pop("right/cam1")
+    assert came_back.recorded > 60
+    assert set(came_back.lost) <= {"camera", "usb"}  # no frame at hand was lost for it
+    assert all(account.lost_total == 0 for account in accounts.values())
+    report = inspect([tmp_path])
+    assert report.problems == []
+    assert "refuses a buffer" in {loss.cause for loss in report.cameras["right/cam1"].lost_indices.values()}.pop()
+    frames = frames_of(tmp_path / "ssd_right/test")
+    assert all(pixels == pixels_of(camera, index).tobytes() for (camera, index), pixels in frames.items())
+
+
+def test_small_messages_of_a_disk_that_hangs_leave_the_frames_their_room(tmp_path):
+    ledger = Ledger([("left", "cam0")], 0, lambda: 0, lambda loss: None)
+    parts = ("left", tmp_path, ["cam0"], (48, 64), DiskConfig(left=tmp_path, right=tmp_path / "b", reserve_mb=0))
+    recorder = Recorder(*parts, SystemDisk(), {}, ledger, SystemClock(), queue_bound=20)
+    ring = Ring(20, PAGE, lock_memory=False)
+    message = SmallMessage(1, 0, 0, 0, b"")
+    for _ in range(AUX_QUEUE + 50):
+        recorder.put_aux((message,))
+    for slot in range(20):
+        recorder.put(FrameItem(("left", "cam0"), slot, ring, slot, None))
+    assert recorder.aux_dropped == 50
+    assert recorder.step(wait_s=0.0)
+    recorder.put_aux((message,))
+    assert recorder.aux_dropped == 50
+    recorder.close([], {})
 
 
 def test_a_camera_that_comes_back_is_tied_to_its_triggers_again(write_config, rig, tmp_path, pixels_of):

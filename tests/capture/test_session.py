@@ -18,8 +18,9 @@ from capture.config import StartConfig, load_config
 from capture.control import Answer, ControlServer, ask
 from capture.daemon import Recording, StopRule
 from capture.disk import SystemDisk
-from capture.errors import CaptureError
+from capture.errors import CameraLost, CaptureError
 from capture.finding import Situation
+from capture.grabber import Grabber
 from capture.preflight import check_burst
 from capture.record import GATE_TOPIC, Gate
 from capture.scan import scan
@@ -156,7 +157,7 @@ def test_the_socket_passes_on_what_it_is_asked(server):
     assert server.path.stat().st_mode & 0o777 == 0o660
 
 
-@pytest.mark.parametrize("line", [b"hello\n", b'{"do": "explode"}\n', b"[]\n", b"x" * 5000, b""])
+@pytest.mark.parametrize("line", [b"hello\n", b'{"do": "explode"}\n', b"[]\n", b"x" * 5000, b"[" * 4000 + b"\n", b""])
 def test_nonsense_on_the_socket_is_refused_and_harms_nobody(server, line):
     with socket.socket(socket.AF_UNIX) as client:
         client.settimeout(5)
@@ -243,6 +244,72 @@ def test_stopped_while_armed_it_leaves_a_whole_recording_of_nothing(write_config
     assert (result.triggers, result.failures) == (0, [])
     report = inspect([tmp_path])
     assert (report.problems, report.triggers) == ([], 0)
+
+
+def test_what_was_said_while_armed_is_in_the_files_although_nothing_began(write_config, rig, tmp_path):
+    class Saying:
+        def start(self, put) -> None:
+            put(GATE_TOPIC, 1, Gate(1, 2, "early", "said while armed").encode())
+
+        def statuses(self) -> list:
+            return []
+
+        def stop(self) -> None:
+            raise RuntimeError("and it cannot even stop")
+
+        def account(self) -> dict[str, str]:
+            return {}
+
+    stop = threading.Event()
+    loaded = load_config(write_config(top='[start]\non = "first-trigger"'))
+    recording = Recording(loaded, SystemClock(), SystemDisk(), lambda _: None, [Saying()])
+    threading.Timer(0.5, stop.set).start()
+    result = recording.run(StopRule(stop))
+    assert result.failures == ["Saying: RuntimeError('and it cannot even stop')"]
+    assert "early" in [gate.name for gate in marks(tmp_path)]
+    assert inspect([tmp_path]).problems == []
+
+
+def test_a_camera_that_goes_while_armed_costs_the_others_nothing(write_config, rig, tmp_path, monkeypatch):
+    arm = Grabber.arm
+
+    def arm_or_gone(self) -> None:
+        if self.place == ("right", "cam1"):
+            rig.cameras["right_cam1"]._gone = True
+            raise CameraLost("unplugged: check its cable")
+        arm(self)
+
+    monkeypatch.setattr(Grabber, "arm", arm_or_gone)
+    _, run = record(write_config())
+    result = run()
+    assert len(result.failures) == 1
+    assert "unplugged" in result.failures[0]
+    lost = {place: account.lost_total for place, account in result.accounts.items()}
+    assert lost.pop(("right", "cam1")) == TRIGGERS
+    assert set(lost.values()) == {0}
+    assert inspect([tmp_path]).problems == []
+
+
+def test_a_start_while_the_recording_is_being_made_does_not_make_another():
+    made: list[Take] = []
+
+    def make() -> Take:
+        made.append(Take(len(made)))
+        if len(made) == 1:
+            session.act("start")  # somebody is impatient
+        return made[-1]
+
+    session = Session(StartConfig(on="command"), make, lambda _: None)
+    thread = threading.Thread(target=session.run, args=(0, 0.0))
+    thread.start()
+    session.act("start")
+    until(lambda: session.state == "recording")
+    session.act("stop")
+    until(lambda: session.results)
+    time.sleep(0.5)
+    assert (session.state, len(made)) == ("idle", 1)
+    session.quit()
+    thread.join(5)
 
 
 def test_preflight_gives_a_burst_and_compares_the_counts(write_config, rig):

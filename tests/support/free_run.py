@@ -59,6 +59,7 @@ def record_free_running(
         disk.make_folder(folder / side)
         lanes.append(make_lane(side, folder / side, {name: opened[side, name] for _, name in group}, parts))
     for lane in lanes:
+        lane.start_writing()
         lane.start()
     for index in range(count):
         edge_ns = start_ns + index * period_ns
