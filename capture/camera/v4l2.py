@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.camera.base import Camera, CameraDescription, CameraSettings, FrameStatus, Grab
-from capture.camera.v4l2_device import Done, Format, V4l2Device
+from capture.camera.v4l2_device import MOST_BUFFERS, Done, Format, V4l2Device
 from capture.camera.v4l2_settings import V4l2Settings, Wishes
 from capture.clock import SystemClock
 from capture.errors import CameraError, CameraLost
@@ -121,7 +121,7 @@ class V4l2Camera(Camera):
             CameraLost: the device is gone.
         """
         device = self._opened()
-        count = max(len(self._waiting), _BUFFERS)
+        count = min(max(len(self._waiting), _BUFFERS), MOST_BUFFERS)  # of slots beyond that, some wait for a free one
         try:
             maps = device.make_buffers(count, self._ours)
             self._stream = _Stream(maps, deque(range(len(maps) or count)))

@@ -22,7 +22,7 @@ _CAPTURE = calls.BufferType.VIDEO_CAPTURE
 _NEEDED = raw.Capability.VIDEO_CAPTURE | raw.Capability.STREAMING
 _DEVICE_CAPS_VALID = 0x80000000
 _MENUS = (calls.ControlType.MENU, calls.ControlType.INTEGER_MENU)
-_MOST_BUFFERS = 32  # of a queue, in every driver
+MOST_BUFFERS = 32  # of a queue, in every driver
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class V4l2Device:
     def make_buffers(self, count: int, ours: bool) -> list[NDArray[np.uint8]]:
         """Make the queue: of the caller's memory (``ours``), or of the driver's, which comes back mapped."""
         self._memory = raw.Memory.USERPTR if ours else raw.Memory.MMAP
-        made = calls.request_buffers(self._fd, _CAPTURE, self._memory, min(count, _MOST_BUFFERS)).count
+        made = calls.request_buffers(self._fd, _CAPTURE, self._memory, min(count, MOST_BUFFERS)).count
         if ours:
             return []
         found = (calls.query_buffer(self._fd, _CAPTURE, self._memory, index) for index in range(made))

@@ -227,3 +227,21 @@ def test_a_device_that_goes_is_lost_and_lets_go_of_our_memory():
     made.close()
     device.given.clear()
     memory.append(0)  # raises BufferError while anybody holds it
+
+
+def test_no_more_buffers_are_queued_than_a_drivers_queue_has():
+    """At 100 Hz a driver is given 40, and V4L2's queues have 32: the others follow as those come back."""
+    device = MadeUpDevice()
+    made = camera(device)
+    made.open()
+    for slot in range(40):
+        made.queue(slot, memoryview(bytearray(WIDTH * HEIGHT)))
+    made.arm()
+    assert sorted(device.given) == list(range(32))
+    device.given.clear()
+    device.done.append(Done(0, WIDTH * HEIGHT, 5, 7_000_000_000, True, False))
+    grab = made.grab(0.0)
+    made.queue(grab.slot, memoryview(bytearray(WIDTH * HEIGHT)))
+    assert list(device.given) == [0]
+    assert made._stream.slots[0] == 32
+    made.close()
