@@ -43,7 +43,9 @@ class BentWing:
     def directions(self, places_m: Array) -> Array:
         """(M, 3, 3) rows span, chord, normal of a wing whose markers are at ``places_m``."""
         middles = (places_m[0::2] + places_m[1::2]) / 2.0
-        along = np.gradient(middles, axis=0)
+        along = np.empty_like(middles)
+        along[1:-1] = (middles[2:] - middles[:-2]) / 2.0
+        along[0], along[-1] = middles[1] - middles[0], middles[-1] - middles[-2]
         span = np.repeat(along / np.linalg.norm(along, axis=1)[:, None], 2, axis=0)
         chord = np.broadcast_to(np.array([-1.0, 0.0, 0.0]), span.shape)
         chord = chord - np.sum(chord * span, axis=1)[:, None] * span

@@ -8,6 +8,7 @@ matched again more tightly. With one, they are the previous places, moved on.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Literal, TypeVar
 
@@ -182,7 +183,7 @@ def match_sighting(
     detections, candidates = sighting.detections, sighting.candidates
     if candidates is None:
         return _match_by_rows(side, layout, *sighting.rays)
-    wing = BentWing(side_name, layout)
+    wing = _wing(side_name, layout)
     followed = None if track is None else _follow(wing, candidates, track, trigger_index, settings)
     result = followed
     if result is None or _leaves_spots(result[0], detections):
@@ -220,6 +221,11 @@ def _split(whole: Rays, counts: Sequence[int]) -> list[Rays]:
 def wing_places_m(side_name: str, layout: MarkerLayout, tip_slope_rad: float) -> Array:
     """(M, 3) markers, body frame, of a wing bent like a cantilever under an even load to a slope at the tip."""
     return BentWing(side_name, layout).bent(tip_slope_rad)
+
+
+@lru_cache(maxsize=8)
+def _wing(side_name: str, layout: MarkerLayout) -> BentWing:
+    return BentWing(side_name, layout)
 
 
 _Result = tuple[Indices, Array, Array]  # chosen candidate, predicted places, cost matrix (markers × candidates)

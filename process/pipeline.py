@@ -4,6 +4,7 @@ The work is cut at every 50th trigger of each side, and matching starts afresh a
 depend on how many processes made it.
 """
 
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -34,6 +35,7 @@ from process.workers import Shared, crew, usable_cores
 BLOCK_TRIGGERS = 50
 GROUP_SETS = 5  # measured together: reads are large, and what a call costs is shared
 BLOCKS_WORTH_A_PROCESS = 4  # starting one costs as much as processing a block or two
+_kept = threading.local()
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
@@ -180,7 +182,7 @@ def measure_block(job: BlockJob) -> BlockResult:
 def _loaded(places: Sequence[SetPlaces]) -> Iterator[list[FrameSet]]:
     """The frame sets, GROUP_SETS at a time, valid until the next; the next ones' bytes are on their way meanwhile."""
     groups = [places[begin : begin + GROUP_SETS] for begin in range(0, len(places), GROUP_SETS)]
-    with FrameSetReader() as one, FrameSetReader() as other, ThreadPoolExecutor(1, "read-ahead") as ahead:
+    with _reader("even") as one, _reader("odd") as other, ThreadPoolExecutor(1, "read-ahead") as ahead:
         waiting = ahead.submit(one.load, groups[0])
         for number, group in enumerate(groups):
             reader, following = (one, other) if number % 2 == 0 else (other, one)
@@ -188,6 +190,14 @@ def _loaded(places: Sequence[SetPlaces]) -> Iterator[list[FrameSet]]:
             if number + 1 < len(groups):
                 waiting = ahead.submit(following.load, groups[number + 1])
             yield [reader.read(where) for where in group]
+
+
+def _reader(name: str) -> FrameSetReader:
+    """A reader of this thread's, whose memory all its blocks use in turn: new memory costs as much as reading it."""
+    if not hasattr(_kept, name):
+        setattr(_kept, name, FrameSetReader())
+    reader: FrameSetReader = getattr(_kept, name)
+    return reader
 
 
 def _process_sets(

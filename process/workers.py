@@ -4,6 +4,7 @@ A job is a small picklable value, what to do with it a function of a module. Res
 process made one, and how many there are, is not to be seen in it.
 """
 
+import gc
 import os
 import pickle
 import threading
@@ -29,7 +30,12 @@ T = TypeVar("T")
 AHEAD = 2  # jobs a process has been given: one in work, one waiting
 START_S = 120.0  # a crew that has not started by then will not
 RETRIES = 3  # of a job whose Dask worker died
-_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+_ENVIRONMENT = {
+    **dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"),
+    # images come and go: memory given back to the system would be cleared for each anew (mallopt(3))
+    "MALLOC_MMAP_THRESHOLD_": "67108864",
+    "MALLOC_TRIM_THRESHOLD_": "134217728",
+}
 
 
 class Crew(Protocol):
@@ -64,10 +70,10 @@ def usable_cores() -> int:
 
 
 @contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Processes started inside use one BLAS thread each: more would only compete for the same cores."""
-    before = {name: os.environ.get(name) for name in _BLAS_THREADS}
-    os.environ.update(dict.fromkeys(_BLAS_THREADS, "1"))
+def worker_environment() -> Iterator[None]:
+    """Processes started inside use one BLAS thread each, since more would only compete, and keep memory they free."""
+    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    os.environ.update(_ENVIRONMENT)
     try:
         yield
     finally:
@@ -106,7 +112,7 @@ def crew(workers: int, scheduler: str | None = None, modules: tuple[str, ...] = 
         context = get_context("spawn")
         ready = context.Barrier(workers + 1)
         with (
-            one_blas_thread(),
+            worker_environment(),
             ProcessPoolExecutor(workers, context, _start, (ready, modules)) as pool,
         ):
             started = [pool.submit(_nothing) for _ in range(workers)]
@@ -210,7 +216,7 @@ def _dask(workers: int, scheduler: str, modules: tuple[str, ...]) -> Iterator[_C
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise UsageError("--scheduler needs Dask: pip install 'wingshape[dask]'") from error
-    with one_blas_thread():
+    with worker_environment():
         if scheduler == "local":
             place: Any = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
@@ -248,6 +254,7 @@ def _start(ready: Any, modules: tuple[str, ...]) -> None:
     threading.Thread(target=_end_with_parent, name="end-with-parent", daemon=True).start()
     cv2.setNumThreads(1)
     _load(modules)
+    gc.freeze()  # what is loaded stays: it need not be looked through again and again
     ready.wait(START_S)
 
 
