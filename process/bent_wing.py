@@ -54,9 +54,9 @@ class BentWing:
 
     def bend_to(self, places_m: Array, measured_m: Array, seen: NDArray[np.bool_]) -> Array:
         """``places_m`` moved smoothly to ``measured_m`` where ``seen``; a weak pull keeps it from running off."""
-        A = np.concatenate([self.basis[seen], np.diag(_PULL)])
-        b = np.concatenate([(measured_m - places_m)[seen], np.zeros((len(_PULL), 3))])
-        return np.asarray(places_m + self.basis @ np.linalg.lstsq(A, b, rcond=None)[0])
+        own = self.basis[seen]
+        bend = np.linalg.solve(own.T @ own + np.diag(_PULL**2), own.T @ (measured_m - places_m)[seen])
+        return np.asarray(places_m + self.basis @ bend)
 
     def predicted(
         self, places_m: Array, measured_m: Array, seen: NDArray[np.bool_], least_sigma_m: float

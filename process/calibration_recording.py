@@ -13,7 +13,7 @@ from capture.errors import ProcessError
 from process.board import Board, View
 from process.calibration_session import Session, find_board
 from process.recording import FrameSetReader, Recording, SetPlaces
-from process.workers import one_blas_thread
+from process.workers import worker_environment
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def _map(jobs: list[_Job], workers: int) -> Iterator[tuple[View, View, tuple[int
     if workers == 1:
         yield from map(_find_set, jobs)
         return
-    with one_blas_thread(), ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+    with worker_environment(), ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         yield from pool.map(_find_set, jobs)
 
 

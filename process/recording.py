@@ -1,7 +1,9 @@
 """A recorded flight to frame sets: the frames of a side's two cameras that one trigger exposed."""
 
+import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -14,6 +16,8 @@ from capture.record import CAMERAS, LOSS_TOPIC, SIDES, Frame, Loss, decode_image
 from process.mcap_file import BadChunk, ChunkReader, MessageHead, Place, index_file
 
 Pixels = NDArray[np.uint8]
+SAMPLE_BYTES = 1e9
+SAMPLE_SETS = 5
 SEARCH_DEPTH = 2  # folders below the one named
 
 
@@ -154,6 +158,29 @@ def open_recording(paths: Sequence[Path | str]) -> Recording:
     sides = _frame_sets(numbered)
     problems.extend(_missing_frames(sides, losses))
     return Recording(sides, tuple(problems), files, fingerprints, (max(times_ns) - min(times_ns)) * 1e-9)
+
+
+def reading_s(recording: Recording, threads: int) -> float:
+    """Seconds that reading all of the recording's frames takes, and nothing else, by so many threads.
+
+    Scaled up from SAMPLE_BYTES spread over it; as they are now, in the page cache or not.
+    """
+    sets = [places for own in recording.sides.values() for places in own]
+    groups = [sets[at : at + SAMPLE_SETS] for at in range(0, len(sets), SAMPLE_SETS)]
+    sizes = [sum(place.chunk_size for one in group for place in one.images if place is not None) for group in groups]
+    wanted = max(threads, round(len(groups) * min(1.0, SAMPLE_BYTES / max(1, sum(sizes)))))
+    picked = np.unique(np.linspace(0, len(groups) - 1, wanted).round().astype(int)).tolist()
+
+    def read(share: list[int]) -> None:
+        with FrameSetReader() as reader:
+            for number in share:
+                reader.load(groups[number])
+
+    began = time.monotonic()
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(read, [picked[first::threads] for first in range(threads)]))
+    part = sum(sizes[number] for number in picked) / max(1, sum(sizes))
+    return float((time.monotonic() - began) / part)
 
 
 def find_files(paths: Sequence[Path | str]) -> tuple[Path, ...]:

@@ -235,7 +235,11 @@ def _check_files(files: dict[str, Path | None]) -> None:
 
 def _speed(summary: dict[str, Any]) -> str:
     times = summary["times_real_time"]
-    return "" if times is None else f" ({times:.1f} × real time without start and report)"
+    if times is None:
+        return ""
+    ratio = summary["read_ratio"]
+    reading = "" if ratio is None else f", {ratio:.1f} × the time of reading alone"
+    return f" ({times:.1f} × real time without start and report{reading})"
 
 
 def _command() -> str:

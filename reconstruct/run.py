@@ -19,7 +19,7 @@ from process.json_file import provenance, write_json
 from process.memory import MemoryWatch
 from process.parts import PartStore
 from process.pipeline import PipelineSettings
-from process.recording import Recording, find_files, open_recording
+from process.recording import Recording, find_files, open_recording, reading_s
 from process.reference import Window
 from process.shared_error import layout_of, sides_of, with_rig
 from process.signal_table import MAX_GAP_S
@@ -152,7 +152,7 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
             *(one.sentence() for one in hangs if abs(one.misfit) > DOUBTFUL_SIGMAS),
         ],
         **holes(found.frames),
-        **_timing(clock, found.frames, resumed),
+        **_timing(clock, found.frames, resumed, source.reading_s),
         "peak_mb": memory.peak_bytes / 1e6,
         **note,
         "flights": [str(path) for path in job.flights],
@@ -236,6 +236,13 @@ class _Source:
             self.problems = tuple(dict.fromkeys((*self._recording.problems, *self.beside.signals.problems)))
             self.flight_s = self._recording.duration_s
 
+    @property
+    def reading_s(self) -> float | None:
+        """How long reading the frames takes by itself; None when there were none, or others read them."""
+        if self._recording is None or self._job.scheduler is not None:
+            return None
+        return reading_s(self._recording, usable_cores())
+
     def note(self, plan: FitPlan) -> dict[str, Any]:
         """How a result of it is made: all that the result depends on."""
         job = self._job
@@ -302,8 +309,9 @@ def _warnings(wing: Wing, sample: Mapping[str, MarkerSeries]) -> list[str]:
     return list(said)
 
 
-def _timing(clock: _Clock, frames: pa.Table, resumed: bool) -> dict[str, Any]:
+def _timing(clock: _Clock, frames: pa.Table, resumed: bool, reading_s: float | None) -> dict[str, Any]:
     """``flight_s`` over the time from the first byte read to the last row written is ``times_real_time``."""
+    worked_s = clock.written - clock.first_byte
     times = frames.column("timestamp_ns").to_numpy()
     flight_s = float(times.max() - times.min()) * 1e-9
     return {
@@ -315,5 +323,6 @@ def _timing(clock: _Clock, frames: pa.Table, resumed: bool) -> dict[str, Any]:
         },
         "wall_s": clock.written - clock.began,
         "flight_s": flight_s,
-        "times_real_time": None if resumed else flight_s / (clock.written - clock.first_byte),
+        "times_real_time": None if resumed else flight_s / worked_s,
+        "read_ratio": None if resumed or not reading_s else worked_s / reading_s,
     }

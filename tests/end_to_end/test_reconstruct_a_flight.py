@@ -4,6 +4,7 @@ import json
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -115,6 +116,7 @@ def test_the_summary_says_how_fast_and_how_large(alone):
     assert summary["flight_s"] == pytest.approx(SECONDS - 0.04)
     worked_s = sum(summary["timing_s"][stage] for stage in ("markers", "fit", "tables"))
     assert summary["times_real_time"] == pytest.approx(summary["flight_s"] / worked_s)
+    assert summary["read_ratio"] > 1.0
     assert 50 < summary["peak_mb"] < 1500
     assert summary["sets_without_shape"] == 0
     assert summary["holes"] == []
@@ -224,3 +226,19 @@ def test_what_is_damaged_is_a_hole(flight, tmp_path):
     frames = pq.read_table(out / "frames.parquet").to_pandas()
     fitted = frames[np.isfinite(frames.tip_dz_m)]
     assert len(fitted) == 600 - lost - 50
+
+
+@pytest.mark.slow
+def test_a_full_size_flight_with_gusts_and_sun(tmp_path):
+    """15 s, calibrated as a real rig is, cold and from the page cache; speed is for the evidence, not for here."""
+    program = Path(__file__).parents[1] / "evidence/reconstruct_speed.py"
+    command = [sys.executable, str(program), str(tmp_path), "--seconds", "15"]
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=280)
+    assert answer.returncode == 0, answer.stderr
+    print(answer.stdout)
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in answer.stdout.splitlines()[2:]]
+    assert [row[1] for row in rows] == ["the disk", "the page cache"]
+    for *_, peak_mb, shape_mm, twist_deg in rows:
+        assert float(peak_mb) < 1500
+        assert float(shape_mm) < 1.0
+        assert float(twist_deg) < 0.2

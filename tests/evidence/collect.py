@@ -87,6 +87,16 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
             "the beam's slow tests: coverage, 5,000 frames, the paper's way", "pytest -q -s -m slow tests/reconstruct"
         ),
     ),
+    "reconstruct": (
+        Step(
+            "speed, memory and accuracy of full-size flights of 15, 30 and 60 s; they take 19 GB",
+            "python tests/evidence/reconstruct_speed.py {target}",
+        ),
+        Step(
+            "killed and resumed, one process or several or Dask: the same",
+            "pytest -q tests/end_to_end/test_reconstruct_a_flight.py",
+        ),
+    ),
     "chain": (Step("a full-size minute through the whole chain", "wingsim demo -o {target}/demo --seconds 60"),),
 }
 

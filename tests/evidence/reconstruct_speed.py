@@ -1,0 +1,95 @@
+"""How fast and how large `reconstruct` is: rendered full-size flights, cold and from the page cache.
+
+``python reconstruct_speed.py FOLDER [--seconds 15,30,60]`` calibrates as for a real rig, renders each flight, evicts it
+from the page cache, reconstructs it, the first one again from the cache, and prints a table with the accuracy.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+BIN = Path(sys.executable).parent
+SUPPORT = Path(__file__).parents[1] / "support"
+
+
+def main() -> None:
+    """Measure."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("folder", type=Path)
+    options.add_argument("--seconds", default="15,30,60")
+    given = options.parse_args()
+    folder: Path = given.folder / "reconstruct-speed"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    calibrate(folder)
+    print("| flight | frames from | × real time | × reading alone | peak MB | shape mm | twist ° |")
+    print("|---|---|---|---|---|---|---|")
+    for number, seconds in enumerate(float(text) for text in given.seconds.split(",")):
+        flight = folder / "flight"
+        sunlit = f"{0.4 * seconds:g}:{0.6 * seconds:g}"
+        run(folder, sys.executable, SUPPORT / "rendered_flight.py", "world.toml", "flight", seconds, "--sunlit", sunlit)
+        evict(flight)
+        report(folder, seconds, "the disk")
+        if number == 0:
+            for path in flight.rglob("*.mcap"):
+                path.read_bytes()
+            report(folder, seconds, "the page cache")
+        shutil.rmtree(flight)
+    shutil.rmtree(folder)
+
+
+def calibrate(folder: Path) -> None:
+    """World, pairs, rig and wing, by the commands a user types."""
+    run(folder, "wingsim", "world", "-o", "world.toml", "--seed", 3)
+    run(folder, "wingsim", "sessions", "--world", "world.toml", "-o", "ground")
+    for side in ("left", "right"):
+        images = [f"ground/board_{side}/cam{number}_*.png" for number in (0, 1)]
+        pattern = ("--board", "10x7", "--square-mm", 30, "-o", f"{side}.json")
+        run(folder, "wingproc", "calibrate", "--cam0", images[0], "--cam1", images[1], *pattern)
+    run(folder, "wingproc", "rig", "left.json", "right.json", "--survey", "ground/survey.toml", "-o", "rig.json")
+    run(folder, "reconstruct", "example", "xhale", "-o", "wing.toml")
+
+
+def report(folder: Path, seconds: float, source: str) -> None:
+    """Reconstruct the flight, compare it with its truth, and print a row."""
+    disks = ("flight/ssd_left", "flight/ssd_right")
+    shutil.rmtree(folder / "out", ignore_errors=True)
+    run(folder, "reconstruct", *disks, "--rig", "rig.json", "--wing", "wing.toml", "-o", "out", "--no-report")
+    summary = json.loads((folder / "out/summary.json").read_text())
+    compared = json.loads(
+        run(folder, "reconstruct", "compare", "out", "flight/truth", "--reference-window", "0:2", "--json")
+    )
+    print(
+        f"| {seconds:g} s | {source} | {summary['times_real_time']:.2f} | {summary['read_ratio']:.1f} | "
+        f"{summary['peak_mb']:.0f} | {compared['displacement_rms_mm']:.2f} | "
+        f"{compared['displacement_twist_rms_deg']:.3f} |",
+        flush=True,
+    )
+
+
+def evict(flight: Path) -> None:
+    """Out of the page cache."""
+    for path in flight.rglob("*.mcap"):
+        descriptor = os.open(path, os.O_RDONLY)
+        os.fsync(descriptor)
+        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+        os.close(descriptor)
+
+
+def run(folder: Path, *words: object) -> str:
+    """What a command says; its own folder is the working one."""
+    command = [str(word) for word in words]
+    beside = BIN / command[0]
+    command[0] = str(beside) if beside.exists() else command[0]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} failed ({done.returncode}): {done.stderr}")
+    return done.stdout
+
+
+if __name__ == "__main__":
+    main()
