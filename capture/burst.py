@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from capture.camera.base import Camera, CameraDescription, FrameStatus, Grab
+from capture.camera.base import Camera, CameraDescription, FrameStatus, Grab, buffer_bytes
 from capture.clock import Clock
 from capture.clock_fit import ClockFit
 from capture.config import DRIVER_BUFFERS
@@ -104,7 +104,7 @@ def _unreported(burst: Burst) -> str:
 
 
 def _arm(camera: Camera, description: CameraDescription) -> list[memoryview]:
-    size = description.width * description.height
+    size = buffer_bytes(description.width, description.height)
     buffers = [memoryview(bytearray(size)) for _ in range(DRIVER_BUFFERS)]
     for slot, buffer in enumerate(buffers):
         camera.queue(slot, buffer)

@@ -272,7 +272,7 @@ class Grabber(Worker):
         time = self._frame_clock.time_of(grab, numbered)
         frame = Frame(
             trigger_index=numbered.index,
-            device_frame_id=grab.frame_id,
+            device_frame_id=grab.frame_id if grab.counter is None else grab.counter,
             device_ticks=grab.device_ticks,
             trigger_time_ns=time.trigger_ns,
             exposure_start_ns=time.exposure_start_ns,
@@ -318,4 +318,4 @@ class Grabber(Worker):
 
     def _queue(self, slot: int) -> None:
         self._slots.add(slot)
-        self._camera.queue(slot, self._layout.pixels(self.ring.slot(slot)))
+        self._camera.queue(slot, self._layout.buffer(self.ring.slot(slot)))

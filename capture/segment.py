@@ -101,8 +101,12 @@ class FrameLayout:
         self._frame_length = _MESSAGE_FIELDS.size + frame_message
 
     def pixels(self, slot: memoryview) -> memoryview:
-        """The part of a slot that the camera fills."""
+        """The part of a slot that holds the image."""
         return slot[self.pixels_at : self.pixels_at + self.pixels_size]
+
+    def buffer(self, slot: memoryview) -> memoryview:
+        """The part of a slot that the camera may fill: the pixels, and behind them what ``seal`` writes in any case."""
+        return slot[self.pixels_at : self._tail_at + _RECORD.size]
 
     def seal(self, slot: memoryview, frame: Frame, stamp_ns: int) -> SealedFrame:
         """Write all records around the pixels of ``slot``, CRC included. The slot must not change afterwards.

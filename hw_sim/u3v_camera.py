@@ -28,8 +28,12 @@ ABRM, SBRM, SIRM, MANIFEST, XML_AT, FEATURES = 0x0, 0x10000, 0x20000, 0x30000, 0
 _STREAM_CONTROL, _PAYLOAD_SIZE = 0x4, 0x8
 _LEADER = struct.Struct("<IHHQHHQIIIIIHH")
 _TRAILER = struct.Struct("<IHHQHHQI")
+_CHUNK_TRAILER = struct.Struct("<IHHQHHQII")  # and the number of the chunks' layout
+_CHUNK_END = struct.Struct("<II")  # behind each chunk: its id, its length
 LEADER_MAGIC, TRAILER_MAGIC = 0x4C563355, 0x54563355
-IMAGE = 1  # payload type
+IMAGE, IMAGE_WITH_CHUNKS = 1, 0x4001  # payload types
+IMAGE_CHUNK, EXPOSURE_CHUNK, GAIN_CHUNK, COUNTER_CHUNK = 0x1000, 0x1001, 0x1002, 0x1003
+_SELECTABLE = ((EXPOSURE_CHUNK, "d"), (GAIN_CHUNK, "d"), (COUNTER_CHUNK, "Q"))  # by ChunkSelector
 
 
 class AccessError(Exception):
@@ -81,6 +85,10 @@ REGISTERS = {
     "GammaEnabled": Register(0x05C, "I", 1, (0, 1)),
     "SensorShutterMode": Register(0x060, "I", 0, (0, 1)),
     "TimestampLatch": Register(0x064, "I", 0, (0, 1)),
+    "ChunkModeActive": Register(0x068, "I", 0, (0, 1)),
+    "ChunkSelector": Register(0x06C, "I", 0, (0, len(_SELECTABLE) - 1)),
+    "ChunkEnable": Register(0x070, "I", 0, (0, 1)),
+    "PayloadSize": Register(0x074, "I", 0),
     "ExposureTime": Register(0x080, "d", 10_000.0, (20.0, 31_900_000.0), 0.5),
     "Gain": Register(0x088, "d", 0.0, (0.0, 24.0), 0.1),
     "BlackLevel": Register(0x090, "d", 1.0, (0.0, 12.5), 0.0125),
@@ -126,6 +134,16 @@ def pattern(number: int, index: int, size: int) -> memoryview:
     return memoryview(bytes(range(PATTERN_PERIOD)) * (size // PATTERN_PERIOD + 2))[begin : begin + size]
 
 
+def own_exposure_us(asked_us: float, index: int) -> float:
+    """How long the camera exposes on trigger ``index``: unlike on a real one, told from what was set."""
+    return asked_us + index % 8
+
+
+def own_gain_db(asked_db: float, index: int) -> float:
+    """Its gain then."""
+    return asked_db + index % 4 / 10
+
+
 class U3vCamera:
     """One camera since it was powered up. Thread-safe.
 
@@ -144,6 +162,7 @@ class U3vCamera:
         self._frame_id = 0
         self._acquiring = False
         self._latched = 0
+        self._chunks: set[int] = set()  # numbers of ChunkSelector
         self._cut_short: set[int] = set()
         self._to_lose: set[int] = set()
         self._held_until = -1
@@ -198,7 +217,7 @@ class U3vCamera:
         """
         name = _BY_ADDRESS.get(address)
         if name is not None:
-            value = self._latched if name == "Timestamp" else self._values[name]
+            value = self._read(name)
             data = struct.pack("<" + REGISTERS[name].format, _number_of(REGISTERS[name], value))
             return data.ljust(size, b"\0")[:size]
         if address == SIRM + _PAYLOAD_SIZE:
@@ -244,6 +263,18 @@ class U3vCamera:
             self._expose(self._frame_id, now_ns)
         elif name == "TimestampLatch":
             self._latched = self._clock_ns(now_ns)
+        elif name == "ChunkEnable":
+            change = self._chunks.add if self._values[name] else self._chunks.discard
+            change(int(self._values["ChunkSelector"]))
+
+    def _read(self, name: str) -> float:
+        if name == "Timestamp":
+            return self._latched
+        if name == "PayloadSize":
+            return self._payload_bytes
+        if name == "ChunkEnable":
+            return self._values["ChunkSelector"] in self._chunks
+        return self._values[name]
 
     def _expose(self, index: int, time_ns: int) -> None:
         if not self.streaming:
@@ -261,14 +292,33 @@ class U3vCamera:
                 return
             width, height, left, top = (int(self._values[n]) for n in ("Width", "Height", "OffsetX", "OffsetY"))
             pixel_format = int(self._values["PixelFormat"])
-            payload = pattern(self._number, index, size // 2 if index in self._cut_short else size)
+            chunks = self._chunk_data(index, frame_id)
+            payload = pattern(self._number, index, self._image_bytes)
+            payload = memoryview(bytes(payload) + chunks) if chunks else payload
             leader = _LEADER.pack(
-                *(LEADER_MAGIC, 0, _LEADER.size, frame_id, 0, IMAGE, self._clock_ns(time_ns)),
-                *(pixel_format, width, height, left, top, 0, 0),
+                *(LEADER_MAGIC, 0, _LEADER.size, frame_id, 0, IMAGE_WITH_CHUNKS if chunks else IMAGE),
+                *(self._clock_ns(time_ns), pixel_format, width, height, left, top, 0, 0),
             )
-            trailer = _TRAILER.pack(TRAILER_MAGIC, 0, _TRAILER.size, frame_id, 0, 0, size, height)
+            layout = (_CHUNK_TRAILER, 1) if chunks else (_TRAILER,)
+            trailer = layout[0].pack(TRAILER_MAGIC, 0, layout[0].size, frame_id, 0, 0, size, height, *layout[1:])
+            payload = payload[: size // 2] if index in self._cut_short else payload
             self._waiting.append(WireFrame(leader, payload, trailer))
             self._changed.notify_all()
+
+    def _chunk_data(self, index: int, frame_id: int) -> bytes:
+        """What follows the pixels: their own end, then each chunk and its end. The frame counter begins at 1."""
+        if not self._values["ChunkModeActive"]:
+            return b""
+        facts = (
+            own_exposure_us(self._values["ExposureTime"], index),
+            own_gain_db(self._values["Gain"], index),
+            frame_id + 1,
+        )
+        data = _CHUNK_END.pack(IMAGE_CHUNK, self._image_bytes)
+        for number in sorted(self._chunks):
+            (chunk_id, format), value = _SELECTABLE[number], facts[number]
+            data += struct.pack("<" + format, value) + _CHUNK_END.pack(chunk_id, struct.calcsize(format))
+        return data
 
     def _forget_frames(self) -> None:
         with self._changed:
@@ -280,6 +330,10 @@ class U3vCamera:
 
     @property
     def _payload_bytes(self) -> int:
+        return self._image_bytes + len(self._chunk_data(0, 0))
+
+    @property
+    def _image_bytes(self) -> int:
         bits = int(self._values["PixelFormat"]) >> 16 & 0xFF
         return int(self._values["Width"] * self._values["Height"]) * bits // 8
 
@@ -314,7 +368,7 @@ def _bootstrap(serial: str, response_ms: int) -> dict[int, bytearray]:
     struct.pack_into("<III", sbrm, 0x14, CONTROL_BYTES, CONTROL_BYTES, 1)
     struct.pack_into("<QI", sbrm, 0x20, SIRM, len(sirm))
     struct.pack_into("<I", sbrm, 0x40, 8)  # SuperSpeed
-    struct.pack_into("<II", sirm, 0x10, _LEADER.size, _TRAILER.size)
+    struct.pack_into("<II", sirm, 0x10, _LEADER.size, _CHUNK_TRAILER.size)
     struct.pack_into("<Q", manifest, 0, 1)
     struct.pack_into("<HBBIQQ20s", manifest, 8, 0, 0, 1, 0x01010000, XML_AT, len(XML), hashlib.sha1(XML).digest())
     return {ABRM: abrm, SBRM: sbrm, SIRM: sirm, MANIFEST: manifest}

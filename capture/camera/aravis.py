@@ -11,6 +11,7 @@ import ctypes
 import time
 from dataclasses import dataclass
 
+from capture.camera.aravis_chunks import FrameFacts
 from capture.camera.aravis_features import Features
 from capture.camera.aravis_library import AravisLibrary, BufferStatus, load_library
 from capture.camera.base import Camera, CameraDescription, CameraSettings, FrameStatus, Grab
@@ -77,7 +78,7 @@ class AravisCamera(Camera):
 
     def queue(self, slot: int, buffer: memoryview) -> None:
         """Give the driver an empty buffer, to be filled in place."""
-        size = self.settings.width * self.settings.height
+        size = self._features.payload_bytes if self._features else self.settings.width * self.settings.height
         self._buffers[slot] = (ctypes.c_char * size).from_buffer(buffer)
         if self._stream is not None:
             self._push(slot, self._stream)
@@ -155,6 +156,8 @@ class AravisCamera(Camera):
     def close(self) -> None:
         """Let go of the device."""
         self.disarm()
+        if self._features is not None:
+            self._features.chunks.close()
         if self._camera is not None:
             library = load_library()
             device = library.call("arv_camera_get_device", self._camera)
@@ -188,22 +191,25 @@ class AravisCamera(Camera):
         status = BufferStatus(library.call("arv_buffer_get_status", pointer))
         ticks = library.call("arv_buffer_get_timestamp", pointer)
         frame_id = library.call("arv_buffer_get_frame_id", pointer)
+        complete = status is BufferStatus.SUCCESS
+        features = self._opened()
+        facts = features.chunks.of(pointer) if complete else FrameFacts()
         library.unref(pointer)
-        if status is not BufferStatus.SUCCESS and not ticks:
+        if not complete and not ticks:
             # Its leader is missing, and with it the time of its exposure: the next frame's id shows that it was lost.
             self._push(slot, stream)
             return None
         del self._buffers[slot]
-        complete = status is BufferStatus.SUCCESS
         return Grab(
             slot,
             _unwrap(stream, frame_id),
             ticks,
             receive_ns,
-            self._opened().exposure_us,
-            self._opened().gain_db,
+            features.exposure_us if facts.exposure_us is None else facts.exposure_us,
+            features.gain_db if facts.gain_db is None else facts.gain_db,
             FrameStatus.COMPLETE if complete else FrameStatus.INCOMPLETE,
             "" if complete else status.name.lower().replace("_", " "),
+            facts.counter,
         )
 
     def _push(self, slot: int, stream: _Stream) -> None:

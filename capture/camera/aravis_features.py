@@ -4,6 +4,7 @@ import ctypes
 from collections.abc import Callable
 from typing import Any
 
+from capture.camera.aravis_chunks import Chunks
 from capture.camera.aravis_library import AravisLibrary
 from capture.camera.base import CameraDescription, CameraSettings
 from capture.errors import CameraError
@@ -35,6 +36,8 @@ class Features:
     def __init__(self, library: AravisLibrary, camera: int, address: str) -> None:
         self.exposure_us = 0
         self.gain_db = 0.0
+        self.payload_bytes = 0  # of a frame: the pixels, and its chunk data behind them
+        self.chunks = Chunks(library, camera)
         self._library = library
         self._camera = camera
         self._address = address
@@ -88,10 +91,13 @@ class Features:
 
     def _description(self, settings: CameraSettings, triggered: bool, is_fake: bool) -> CameraDescription:
         size = settings.width * settings.height
-        payload = self._call("arv_camera_get_payload")
-        if payload != size:
+        chunks = self.chunks.turn_on(size)
+        if chunks:
+            self._taken["chunks"] = chunks
+        self.payload_bytes = self._call("arv_camera_get_payload")
+        if self.payload_bytes != size and not self.chunks.active:
             raise CameraError(
-                f"{self._address}: the camera wants to send {payload} bytes a frame, not {settings.width}×"
+                f"{self._address}: the camera wants to send {self.payload_bytes} bytes a frame, not {settings.width}×"
                 f"{settings.height} = {size}: turn off chunk data and padding in its own settings"
             )
         firmware = next((self._string(name) for name in _FIRMWARE if self._has(name)), "")

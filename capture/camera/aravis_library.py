@@ -68,7 +68,10 @@ _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_get_black_level": (c_double, (c_void_p,)),
     "arv_camera_set_black_level": (None, (c_void_p, c_double)),
     "arv_camera_get_black_level_bounds": (None, (c_void_p, POINTER(c_double), POINTER(c_double))),
+    "arv_camera_dup_available_enumerations_as_strings": (POINTER(c_char_p), (c_void_p, c_char_p, POINTER(c_uint))),
     "arv_camera_get_payload": (c_uint, (c_void_p,)),
+    "arv_chunk_parser_get_float_value": (c_double, (c_void_p, c_void_p, c_char_p)),
+    "arv_chunk_parser_get_integer_value": (c_int64, (c_void_p, c_void_p, c_char_p)),
     "arv_camera_create_stream": (c_void_p, (c_void_p, c_void_p, c_void_p)),
     "arv_camera_start_acquisition": (None, (c_void_p,)),
     "arv_camera_stop_acquisition": (None, (c_void_p,)),
@@ -90,9 +93,11 @@ _PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_get_device": (c_void_p, (c_void_p,)),
     "arv_camera_is_gv_device": (c_int, (c_void_p,)),
     "arv_camera_is_uv_device": (c_int, (c_void_p,)),
+    "arv_camera_create_chunk_parser": (c_void_p, (c_void_p,)),
     "arv_gv_device_is_controller": (c_int, (c_void_p,)),
     "arv_camera_uv_set_usb_mode": (None, (c_void_p, c_int)),
     "arv_buffer_new_full": (c_void_p, (c_size_t, c_void_p, c_void_p, c_void_p)),
+    "arv_buffer_has_chunks": (c_int, (c_void_p,)),
     "arv_buffer_get_status": (c_int, (c_void_p,)),
     "arv_buffer_get_user_data": (c_void_p, (c_void_p,)),
     "arv_buffer_get_frame_id": (c_uint64, (c_void_p,)),
@@ -133,6 +138,8 @@ class AravisLibrary:
         self._gobject.g_signal_handler_disconnect.argtypes = (c_void_p, ctypes.c_ulong)
         self._gobject.g_signal_handler_disconnect.restype = None
         self._glib.g_error_free.argtypes = (POINTER(_GError),)
+        self._glib.g_free.argtypes = (c_void_p,)
+        self._glib.g_free.restype = None
         self.version = tuple(int(self.call(f"arv_get_{part}_version")) for part in ("major", "minor", "micro"))
 
     @property
@@ -156,6 +163,10 @@ class AravisLibrary:
             self._glib.g_error_free(error)
             raise CameraError(message)
         return result
+
+    def free(self, array: Any) -> None:
+        """Give back an array that a function has made."""
+        self._glib.g_free(array)
 
     def unref(self, instance: int) -> None:
         """Let go of an object; with the last reference it is gone, and a stream's thread has ended."""

@@ -8,6 +8,14 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import IntEnum
 
+CHUNK_BYTES = 160
+"""Room behind the pixels of a driver's buffer for what a camera says of the frame itself (GenICam chunk data)."""
+
+
+def buffer_bytes(width: int, height: int) -> int:
+    """How large a buffer must be that a camera is given."""
+    return width * height + CHUNK_BYTES
+
 
 @dataclass(frozen=True)
 class CameraSettings:
@@ -57,13 +65,14 @@ class Grab:
     """One buffer back from the driver."""
 
     slot: int  # which buffer
-    frame_id: int  # the device's own frame counter, wraps
+    frame_id: int  # the frame counter of the transport, wraps
     device_ticks: int  # the device's clock at start of exposure of row 0
     receive_ns: int  # host UTC when the whole frame was there
-    exposure_us: int
+    exposure_us: int  # the frame's own where the camera says it, else as read back when it was set; so the gain
     gain_db: float
     status: FrameStatus
     detail: str = ""  # why it is incomplete, in the driver's words
+    counter: int | None = None  # the device's own frame counter, where the frame holds it
 
 
 class Camera(ABC):
@@ -83,7 +92,9 @@ class Camera(ABC):
 
     @abstractmethod
     def queue(self, slot: int, buffer: memoryview) -> None:
-        """Give the driver an empty buffer of at least width × height bytes, to be filled in place.
+        """Give the driver an empty buffer of at least ``buffer_bytes``, to be filled in place.
+
+        The pixels come first. What is behind them may be written to as well, until the buffer is grabbed.
 
         Never raises on a camera that is gone: ``grab`` tells.
         """

@@ -11,6 +11,7 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 
+from capture.camera.base import buffer_bytes
 from capture.disk import SystemDisk
 from capture.errors import DiskError
 from capture.record import Frame, image_prefix
@@ -62,15 +63,21 @@ def test_layout_is_aligned_for_any_size(width, height, name):
     layout = FrameLayout(1, 2, name, width, height)
     assert layout.pixels_at % PAGE == layout.slot_bytes % PAGE == 0
     slot = memoryview(bytearray(layout.slot_bytes))
+    buffer = layout.buffer(slot)
+    assert len(buffer) >= buffer_bytes(width, height)
+    buffer[:] = b"\xff" * len(buffer)  # as a camera with chunk data does
     sealed = layout.seal(slot, frame_of(3), 5)
     assert len(sealed.slot) == layout.slot_bytes
     # The records tile the slot exactly, whatever the size.
     at, opcodes = 0, []
     while at < layout.slot_bytes:
         opcodes.append(slot[at])
-        at += 9 + int.from_bytes(slot[at + 1 : at + 9], "little")
+        last = int.from_bytes(slot[at + 1 : at + 9], "little")
+        at += 9 + last
     assert at == layout.slot_bytes
     assert opcodes == [0x80, 6, 7, 7, 0x80]
+    assert set(slot[layout.pixels_at : layout.pixels_at + layout.pixels_size]) == {0xFF}
+    assert not any(slot[len(slot) - last :]), "verify wants padding to be empty"
 
 
 def test_a_short_write_and_a_full_disk_name_the_file(tmp_path, monkeypatch):

@@ -45,6 +45,8 @@ def test_the_xml_describes_the_registers_that_there_are():
     described = {}
     for kind, formats in (("IntReg", "IQ"), ("FloatReg", "d")):
         for node in root.iter(NAMESPACE + kind):
+            if node.findtext(NAMESPACE + "pPort") != "Device":  # in the chunk data, not in a register
+                continue
             name = node.attrib["Name"].removesuffix("Reg")
             described[name] = int(node.findtext(NAMESPACE + "Address"), 16) - FEATURES
             register = REGISTERS[name]
@@ -54,7 +56,7 @@ def test_the_xml_describes_the_registers_that_there_are():
     assert described == {name: register.at for name, register in REGISTERS.items()}
     names = {node.attrib["Name"] for node in root.iter() if "Name" in node.attrib}
     for node in root.iter():
-        if node.tag.removeprefix(NAMESPACE) in ("pFeature", "pValue", "pMax", "pVariable", "pPort"):
+        if node.tag.removeprefix(NAMESPACE) in ("pFeature", "pValue", "pMax", "pVariable", "pPort", "pSelected"):
             assert node.text in names
 
 
@@ -93,6 +95,31 @@ def test_an_edge_gives_a_frame_with_the_devices_own_time():
     assert np.array_equal(np.frombuffer(frame.payload, np.uint8), (k + 17 * 12 + 60 * 1) % 251)
     assert frame.trailer[:4] == b"U3VT"
     assert struct.unpack_from("<Q", frame.trailer, 20) == (64 * 48,)
+
+
+def test_chunk_data_follows_the_pixels():
+    """Little-endian, as USB3 Vision wants it: each chunk, the image among them, and then its id and its length."""
+    device = taking()
+    for name, value in {"ChunkModeActive": 1, "ChunkSelector": 0, "ChunkEnable": 1}.items():
+        put(device, name, value)
+    for selector in (1, 2):
+        put(device, "ChunkSelector", selector)
+        assert get(device, "ChunkEnable") == 0
+        put(device, "ChunkEnable", 1)
+    size = 64 * 48
+    assert get(device, "PayloadSize") == size + 8 + 3 * 16
+    device.edge(5, POWER_UP_NS)
+    frame = device.next_frame(0.0)
+    assert struct.unpack_from("<H", frame.leader, 18) == (0x4001,)
+    assert bytes(frame.payload[:size]) == bytes(pattern(1, 5, size))
+    assert struct.unpack("<IIdIIdIIQII", frame.payload[size:]) == (
+        *(0x1000, size, 10_005.0, 0x1001, 8, 0.1, 0x1002, 8, 1, 0x1003, 8),
+    )
+    assert struct.unpack_from("<Q", frame.trailer, 20) == (len(frame.payload),)
+    put(device, "ChunkModeActive", 0)
+    device.sent(frame)
+    device.edge(6, POWER_UP_NS)
+    assert len(device.next_frame(0.0).payload) == get(device, "PayloadSize") == size
 
 
 def test_no_frame_before_the_start_nor_on_another_line():

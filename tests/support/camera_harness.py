@@ -37,6 +37,8 @@ class Harness(ABC):
     """Whether a second program is refused the camera."""
     refused: ClassVar[tuple[tuple[dict[str, object], str], ...]] = ()
     """Settings that the camera must refuse (changes to ``settings``), and what the message must hold (a regex)."""
+    chunk_bytes: ClassVar[int] = 0
+    """How much the camera sends behind the pixels."""
     missing_address: ClassVar[str] = "no-such-camera"
     """An address where no camera is."""
     frame_within_s: float = 2.0
@@ -55,6 +57,10 @@ class Harness(ABC):
     @abstractmethod
     def __exit__(self, *exception: object) -> None:
         """End."""
+
+    def facts(self, index: int) -> tuple[int, float, int] | None:
+        """Exposure in us, gain in dB and the camera's own count of the frame of trigger ``index``, if it tells them."""
+        return None
 
     def trigger(self) -> None:
         """One edge on the trigger line. Never called on a camera that runs free."""

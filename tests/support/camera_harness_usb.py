@@ -10,7 +10,7 @@ from capture.camera.aravis_library import LIBRARY
 from capture.camera.base import CameraSettings
 from capture.clock import SystemClock
 from hw_sim.u3v import U3vPlug
-from hw_sim.u3v_camera import Kind
+from hw_sim.u3v_camera import Kind, own_exposure_us, own_gain_db
 
 BUFFER_FRAMES = 4
 _ENUMERATED_S = 20.0
@@ -28,6 +28,7 @@ class UsbHarness(Harness):
         ({"trigger_line": "Line9"}, r"TriggerSource Line9 was asked, .* set `camera.trigger_line`"),
         ({"shutter_mode": "Global"}, r"SensorShutterMode Global was asked, .* set `camera.shutter_mode`"),
     )
+    chunk_bytes = 4 * 8 + 3 * 8  # four ends of 8 bytes, three values of 8
     frame_within_s = 10.0
     loss_within_s = 20.0
     back_within_s = 30.0
@@ -44,6 +45,10 @@ class UsbHarness(Harness):
 
     def __exit__(self, *exception: object) -> None:
         self._device.unplug()
+
+    def facts(self, index: int) -> tuple[int, float, int]:
+        asked = self.settings
+        return round(own_exposure_us(asked.exposure_us, index)), own_gain_db(asked.gain_db, index), index + 1
 
     def trigger(self) -> None:
         camera = self._device.camera

@@ -9,6 +9,7 @@ from mcap.reader import make_reader
 
 from capture.record import CAN_TOPIC, CanFrame, Frame, decode_image
 from capture.verify import inspect
+from hw_sim.u3v_camera import own_exposure_us, own_gain_db
 
 pytestmark = pytest.mark.slow
 TRIGGERS = 100
@@ -63,8 +64,9 @@ def test_every_frame_shows_the_trigger_it_is_filed_under(usb_folders):
     assert seen > 3 * TRIGGERS
 
 
-def test_the_cameras_own_counters_are_recorded(usb_folders):
-    """Frame ids count exposures since power-up: the trigger index, and from 0 again after the plug was pulled."""
+def test_what_the_cameras_say_of_each_frame_is_recorded(usb_folders):
+    """In their chunk data: frames since power-up, so the trigger index and one, and from 1 again after the plug was
+    pulled; and the frame's own exposure and gain, which these cameras tell from what was set."""
     ids: dict[str, dict[int, int]] = {}
     for path in sorted(path for folder in usb_folders for path in folder.glob("*_*.mcap") if "aux" not in path.name):
         with path.open("rb") as file:
@@ -72,11 +74,14 @@ def test_the_cameras_own_counters_are_recorded(usb_folders):
                 if channel.topic.endswith("/frame"):
                     frame = Frame.decode(message.data)
                     place = channel.topic[1:].removesuffix("/frame")
-                    ids.setdefault(place, {})[frame.trigger_index] = frame.device_frame_id
+                    index = frame.trigger_index
+                    ids.setdefault(place, {})[index] = frame.device_frame_id
+                    assert frame.exposure_us == round(own_exposure_us(2000, index))
+                    assert frame.gain_db == pytest.approx(own_gain_db(0.0, index))
     for place in (CUT_SHORT, HELD, LOSING):
-        assert all(index == frame_id for index, frame_id in ids[place].items())
+        assert all(index + 1 == frame_id for index, frame_id in ids[place].items())
     back = min(index for index in ids[PULLED] if index >= 16)
-    assert all(frame_id == (index if index < 16 else index - back) for index, frame_id in ids[PULLED].items())
+    assert all(frame_id == 1 + (index if index < 16 else index - back) for index, frame_id in ids[PULLED].items())
 
 
 def test_the_hardware_counts_the_same(usb_flight, report):

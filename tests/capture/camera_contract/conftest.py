@@ -8,7 +8,7 @@ import pytest
 from camera_harness import SLOW, Harness, make_harness, wanted_harnesses
 
 from capture.camera import make_camera
-from capture.camera.base import Camera, CameraDescription, Grab
+from capture.camera.base import Camera, CameraDescription, Grab, buffer_bytes
 from capture.errors import CameraError
 from capture.ring import PAGE, Ring
 
@@ -22,7 +22,8 @@ class Bench:
     def __init__(self, harness: Harness) -> None:
         self.harness = harness
         self.size = harness.settings.width * harness.settings.height
-        self.ring = Ring(SLOTS, PAGE + -(-self.size // PAGE) * PAGE + PAGE, lock_memory=False)
+        self.buffer_bytes = buffer_bytes(harness.settings.width, harness.settings.height)
+        self.ring = Ring(SLOTS, PAGE + -(-self.buffer_bytes // PAGE) * PAGE + PAGE, lock_memory=False)
         self.camera = self.make()
         for slot in range(SLOTS):
             self.wipe(slot)
@@ -37,10 +38,13 @@ class Bench:
     def pixels(self, slot: int) -> memoryview:
         return self.ring.slot(slot)[PAGE : PAGE + self.size]
 
+    def buffer(self, slot: int) -> memoryview:
+        return self.ring.slot(slot)[PAGE : PAGE + self.buffer_bytes]
+
     def intact(self, slot: int) -> bool:
-        """Whether nothing outside the pixels was touched."""
-        whole = self.ring.slot(slot)
-        return set(whole[:PAGE]) == {EMPTY} == set(whole[PAGE + self.size :])
+        """Whether nothing was touched outside the pixels and what the camera sends behind them."""
+        whole, end = self.ring.slot(slot), PAGE + self.size + self.harness.chunk_bytes
+        return set(whole[:PAGE]) == {EMPTY} == set(whole[end:])
 
     def open(self) -> CameraDescription:
         """Open, patiently: after an unplug a device needs its time."""
@@ -57,7 +61,7 @@ class Bench:
         """Open, queue, arm."""
         description = self.open()
         for slot in range(slots):
-            self.camera.queue(slot, self.pixels(slot))
+            self.camera.queue(slot, self.buffer(slot))
         self.camera.arm()
         return description
 
@@ -80,7 +84,7 @@ class Bench:
             grab = self.camera.grab(self.harness.frame_within_s)
             assert grab is not None
             ids.append(grab.frame_id)
-            self.camera.queue(grab.slot, self.pixels(grab.slot))
+            self.camera.queue(grab.slot, self.buffer(grab.slot))
         return ids
 
     def grab_until_lost(self) -> None:

@@ -42,6 +42,16 @@ def test_frames_land_whole_in_the_buffers_given_and_nowhere_else(bench):
         assert abs(time.time_ns() - grab.receive_ns) < 60e9
 
 
+def test_each_frame_has_its_own_exposure_gain_and_count_where_the_camera_tells_them(bench):
+    camera = bench.start()
+    for index in range(SLOTS):
+        grab = bench.frame(camera)
+        told = bench.harness.facts(index)
+        said = (grab.exposure_us, pytest.approx(grab.gain_db, nan_ok=True), grab.counter)
+        assert said == (told or (camera.exposure_us, camera.gain_db, None))
+        time.sleep(PERIOD_S)
+
+
 def test_counter_and_clock_go_on_with_every_frame(bench):
     camera = bench.start()
     grabs = []
@@ -76,7 +86,7 @@ def test_frames_without_a_buffer_are_lost_and_a_camera_that_counts_shows_it(benc
         grabs.append(grab)
     assert len(grabs) <= 2
     for grab in grabs:
-        bench.camera.queue(grab.slot, bench.pixels(grab.slot))
+        bench.camera.queue(grab.slot, bench.buffer(grab.slot))
     last = bench.frame(camera)
     step = (last.frame_id - grabs[-1].frame_id) % (1 << camera.frame_id_bits)
     assert step > 1 if camera.frame_counter else step == 1
@@ -93,7 +103,7 @@ def test_after_disarm_the_memory_is_ours_and_the_camera_can_be_armed_again(bench
     time.sleep(4 * PERIOD_S)
     assert all(set(bench.ring.slot(slot)) == {0xA5} for slot in range(SLOTS))
     for slot in range(SLOTS):
-        bench.camera.queue(slot, bench.pixels(slot))
+        bench.camera.queue(slot, bench.buffer(slot))
     bench.camera.arm()
     for _ in range(3):
         assert bench.frame(camera).status is FrameStatus.COMPLETE
@@ -174,7 +184,7 @@ def test_a_frame_delivered_in_part_is_never_called_complete(bench):
     torn = bench.camera.grab(1.0)
     assert torn is None or (torn.status is FrameStatus.INCOMPLETE and torn.detail)
     if torn is not None:
-        bench.camera.queue(torn.slot, bench.pixels(torn.slot))
+        bench.camera.queue(torn.slot, bench.buffer(torn.slot))
     following = bench.frame(camera)
     assert following.status is FrameStatus.COMPLETE
     assert (following.frame_id - first.frame_id) % (1 << camera.frame_id_bits) == 2
@@ -189,7 +199,7 @@ def test_a_pulled_plug_is_told_and_the_camera_comes_back(bench):
     bench.harness.unplug()
     with pytest.raises(CameraLost, match=r"check|running"):
         bench.grab_until_lost()
-    bench.camera.queue(0, bench.pixels(0))
+    bench.camera.queue(0, bench.buffer(0))
     bench.camera.disarm()
     bench.camera.close()
     with pytest.raises(CameraError):
