@@ -3,6 +3,7 @@
 Names as the GenICam Standard Features Naming Convention has them under "Chunk Data Control".
 """
 
+import contextlib
 import ctypes
 import math
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from capture.camera.base import CHUNK_BYTES
 from capture.errors import CameraError
 
 _EXPOSURE, _GAIN = "ExposureTime", "Gain"  # as a feature and, with Chunk before it, as a chunk: in the same unit
+_IMAGE = "Image"  # the pixels are a chunk too
 _COUNTERS = ("FrameID", "FrameCounter")  # the first that a camera has; makers' names for the same
 
 
@@ -89,11 +91,11 @@ class Chunks:
         wanted = [name for name in (_EXPOSURE, _GAIN) if name in there and self._has(name)] + [counter or ""]
         on = []
         for name in there:
-            self._call("arv_camera_set_string", b"ChunkSelector", name.encode())
-            try:
-                self._call("arv_camera_set_boolean", b"ChunkEnable", int(name in wanted))
-            except CameraError:  # the image itself is a chunk that cannot be turned off
+            if name == _IMAGE:
                 continue
+            self._call("arv_camera_set_string", b"ChunkSelector", name.encode())
+            with contextlib.suppress(CameraError):  # it may be one that is always on, or always off
+                self._call("arv_camera_set_boolean", b"ChunkEnable", int(name in wanted))
             if name in wanted and self._call("arv_camera_get_boolean", b"ChunkEnable"):
                 on.append(name)
         return on

@@ -20,7 +20,7 @@ class MadeUpLibrary:
     enabled: dict[str, bool]
     features: set[str] = field(default_factory=lambda: {"ChunkModeActive", "ExposureTime", "Gain"})
     chunk_bytes: int = 16
-    stuck: tuple[str, ...] = ("Image",)  # what cannot be switched
+    stuck: tuple[str, ...] = ()  # what cannot be switched
     unreadable: tuple[str, ...] = ()
     active: bool = True  # somebody left it on
     selected: str = ""
@@ -58,7 +58,9 @@ class MadeUpLibrary:
         return (ctypes.c_char_p * len(self.enabled))(*(chunk.encode() for chunk in self.enabled))
 
     def _camera_get_payload(self, camera):
-        return IMAGE_BYTES + self.active * (8 + self.chunk_bytes * sum(self.enabled.values()))
+        return IMAGE_BYTES + self.active * (
+            8 + self.chunk_bytes * sum(on for name, on in self.enabled.items() if name != "Image")
+        )
 
     def _camera_create_chunk_parser(self, camera):
         return 77
@@ -76,10 +78,15 @@ class MadeUpLibrary:
 
 
 def test_what_is_of_use_is_turned_on_and_all_else_off():
-    library = MadeUpLibrary({"Image": False, "Timestamp": True, "FrameID": False, "Gain": False, "ExposureTime": False})
+    library = MadeUpLibrary({"Image": True, "Timestamp": True, "FrameID": False, "Gain": False, "ExposureTime": False})
     chunks = Chunks(library, 1)
     assert chunks.turn_on(IMAGE_BYTES) == "FrameID Gain ExposureTime"
-    assert [name for name, enabled in library.enabled.items() if enabled] == ["FrameID", "Gain", "ExposureTime"]
+    assert [name for name, enabled in library.enabled.items() if enabled] == [
+        "Image",
+        "FrameID",
+        "Gain",
+        "ExposureTime",
+    ]
     assert library.active
     assert chunks.active
     assert library.freed == 1
@@ -111,6 +118,11 @@ def test_what_does_not_fit_or_says_nothing_is_turned_off(changes, why):
     assert not library.active
     assert not chunks.active
     assert chunks.of(5) == FrameFacts()
+
+
+def test_one_that_is_always_on_is_used():
+    chunks = Chunks(MadeUpLibrary({"FrameID": True, "Gain": False}, stuck=("FrameID",)), 1)
+    assert chunks.turn_on(IMAGE_BYTES) == "FrameID Gain"
 
 
 def test_a_camera_without_chunk_data_is_left_alone():
