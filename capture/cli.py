@@ -15,7 +15,7 @@ from rich.table import Table
 from capture import bench_report
 from capture.bench import CEILING_PAIRS, MODES, bench_cases, bench_target, ceiling, run_case
 from capture.clock import SystemClock
-from capture.companions import make_companions
+from capture.companions import make_companions, make_signal
 from capture.config import load_config
 from capture.console import Narrator, run, say, say_json
 from capture.control_command import controlled, start, stop
@@ -70,8 +70,9 @@ def record(
     with sole_recorder(disks), HealthWriter(loaded.config, clock, service.event) as health:
 
         def make() -> Recording:
-            companions = [*make_companions(loaded.config, clock), AfterPower(disks)]
-            return Recording(loaded, clock, SystemDisk(), service.event, companions, health, service)
+            begins = make_signal(loaded.config, clock)
+            companions = [*make_companions(loaded.config, clock, begins), AfterPower(disks)]
+            return Recording(loaded, clock, SystemDisk(), service.event, companions, health, service, begins)
 
         def idle() -> None:
             health.source = idle_health

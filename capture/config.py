@@ -53,11 +53,32 @@ class DiskConfig(_Table):
     takeover: bool = False  # when a disk fails, its side goes on on the other one
 
 
+class GpioConfig(_Table):
+    """An input line of a GPIO chip of this computer."""
+
+    chip: Annotated[str, Field(pattern=r"^/.+$")]
+    line: Annotated[int, Field(ge=0, lt=2**32)]
+    active: Literal["high", "low"] = "high"
+    debounce_ms: Annotated[float, Field(ge=0, le=1000)] = 10.0  # a level counts when it has lasted so long; 0: at once
+
+
 class StartConfig(_Table):
     """What starts a recording, and what is tried just before it."""
 
-    on: Literal["power-up", "command", "first-trigger"] = "power-up"
+    on: Literal["power-up", "command", "first-trigger", "mavlink-arm", "gpio"] = "power-up"
     burst: Annotated[int, Field(ge=0, le=100)] = 0  # triggers of the test burst; 0: none
+    disarm_ends_after_s: Annotated[float | None, Field(ge=0)] = None  # of `mavlink-arm`; None: disarming ends nothing
+    gpio: GpioConfig | None = None
+
+    @model_validator(mode="after")
+    def _has_what_it_needs(self) -> "StartConfig":
+        if self.on == "gpio" and self.gpio is None:
+            raise ValueError('on = "gpio" needs the table [start.gpio] with `chip` and `line`: add it')
+        if self.on != "gpio" and self.gpio is not None:
+            raise ValueError(f'the table [start.gpio] does nothing with on = "{self.on}": remove one of them')
+        if self.on != "mavlink-arm" and self.disarm_ends_after_s is not None:
+            raise ValueError(f'disarm_ends_after_s does nothing with on = "{self.on}": remove one of them')
+        return self
 
 
 class RingConfig(_Table):
@@ -209,6 +230,14 @@ class Config(_Table):
         for bus in buses:
             if buses.count(bus) > 1:
                 raise ValueError(f"can: the bus {bus} is there twice")
+        return self
+
+    @model_validator(mode="after")
+    def _autopilot_is_heard(self) -> "Config":
+        if self.start.on == "mavlink-arm" and self.mavlink is None:
+            raise ValueError(
+                'start.on = "mavlink-arm" needs the table [mavlink] with the autopilot\'s `address`: add it'
+            )
         return self
 
     @property

@@ -3,7 +3,6 @@
 import contextlib
 import datetime
 import json
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -30,9 +29,11 @@ from capture.ptp import FREE_RUNNING, PtpWatch
 from capture.record import SIDES, Diagnostic
 from capture.recorder import Recorder
 from capture.service import Service
+from capture.start_signal import StartSignal
+from capture.stop_rule import StopRule
 from capture.trigger import BoardCount, TriggerLog
 from capture.trigger_run import TriggerRun
-from capture.vitals import Vitals
+from capture.vitals import ARMED, Vitals
 from capture.watchdog import IDLE, progress
 from capture.worker import Worker, share_interpreter
 
@@ -40,15 +41,6 @@ CONTROL_PERIOD_S = 0.1
 DIAGNOSTICS_PERIOD_S = 1.0
 DRAIN_DEADLINE_S = 2.0  # how long frames of the last triggers may take to arrive
 FLUSH_DEADLINE_S = 60.0  # how long the disks may take to write what is in the rings
-
-
-@dataclass(frozen=True)
-class StopRule:
-    """When a recording ends by itself; it always ends when ``requested`` is set."""
-
-    requested: threading.Event
-    triggers: int = 0  # 0: no limit
-    duration_s: float = 0.0  # 0: no limit
 
 
 @dataclass
@@ -69,6 +61,7 @@ class RecordingResult:
     aux_dropped: int  # small messages that one of the disks did not take
     absences: dict[Place, list[Absence]] = field(default_factory=dict)  # of cameras that were gone for a time
     failures: list[str] = field(default_factory=list)
+    again: bool = False  # what began it has ended it; the next one waits for it
 
     @property
     def recorded(self) -> int:
@@ -117,8 +110,10 @@ class Recording:
         companions: Sequence[Companion] = (),
         health: HealthWriter | None = None,
         service: Service | None = None,
+        signal: StartSignal | None = None,
     ) -> None:
         self._disk = disk
+        self._signal = signal
         self._loaded = loaded
         self._config: Config = loaded.config
         self._clock = clock
@@ -126,7 +121,7 @@ class Recording:
         self._unattended = service is not None and service.managed
         started = datetime.datetime.fromtimestamp(clock.utc_ns() / 1e9, datetime.UTC)
         self.flight = self._config.flight or f"flight_{started:%Y%m%dT%H%M%SZ}"
-        if self._config.flight is None or self._unattended:
+        if self._config.flight is None or self._unattended or self._config.start.disarm_ends_after_s is not None:
             self.flight = free_name(self.flight, (self._config.disks.left, self._config.disks.right))
         self._aux = AuxLog(clock)
         self._triggers = TriggerLog(self._config.trigger.rate_hz)
@@ -201,8 +196,8 @@ class Recording:
     def _may_begin(self, run: TriggerRun, stop: StopRule) -> bool:
         """Wait, armed, for what starts the recording, and try the triggers; False: told to stop before."""
         start = self._config.start
-        self._vitals.state = "armed"
-        while start.on == "first-trigger" and not run.in_flight and not run.strays:
+        self._vitals.state = ARMED
+        while not (run.in_flight or stop.begin.is_set() or self._is_told(run)):
             if stop.requested.wait(CONTROL_PERIOD_S):
                 return False
             self._flush_aux()
@@ -219,6 +214,11 @@ class Recording:
                 self._config.camera.time_sigma_limit_us,
             )
         return not stop.requested.is_set()
+
+    def _is_told(self, run: TriggerRun) -> bool:
+        if self._signal is not None:
+            return self._signal.begun
+        return self._config.start.on != "first-trigger" or bool(run.strays)
 
     def _make_run(self) -> TriggerRun:
         return TriggerRun(
@@ -364,9 +364,9 @@ class Recording:
             if now_s >= next_report_s:
                 next_report_s += DIAGNOSTICS_PERIOD_S
                 self._report()
-            if stop.triggers and self._triggers_so_far() >= stop.triggers:
+            if stop.reached(self._triggers_so_far(), now_s - started_s):
                 return
-            if stop.duration_s and now_s - started_s >= stop.duration_s:
+            if self._signal is not None and self._signal.ended:
                 return
             over = run.watch()
             if over is not None:
@@ -467,6 +467,7 @@ class Recording:
             aux_dropped=sum(recorder.aux_dropped for recorder in self._recorders.values()),
             absences={place: grabber.absences for place, grabber in self._grabbers.items() if grabber.absences},
             failures=self._failures,
+            again=self._signal is not None and self._signal.ended,
         )
 
     def _triggers_so_far(self) -> int:

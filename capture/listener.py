@@ -50,7 +50,7 @@ class Link(Protocol):
 class Listener:
     """A companion that keeps a link open in a thread of its own. It never stops a recording."""
 
-    def __init__(self, name: str, connect: Callable[[], Link], clock: Clock) -> None:
+    def __init__(self, name: str, connect: Callable[[], Link], clock: Clock, may_be_silent: bool = False) -> None:
         """``connect`` opens the link and raises ``LinkError`` when it cannot."""
         self.name = name
         self.messages = 0
@@ -58,6 +58,7 @@ class Listener:
         self.outages_in_all = 0
         self._connect = connect
         self._clock = clock
+        self._may_be_silent = may_be_silent
         self._put: Put | None = None
         self._lost: Counter[str] = Counter()  # on links that are closed
         self._link: Link | None = None
@@ -83,7 +84,7 @@ class Listener:
         values = (("messages", str(self.messages)), ("lost", json.dumps(lost)), ("outages", str(self.outages_in_all)))
         if not self._sound:
             return [Diagnostic(2, self.name, self._trouble, values)]
-        if now_s - self._heard_s > SILENT_S:
+        if now_s - self._heard_s > SILENT_S and not self._may_be_silent:
             return [Diagnostic(1, self.name, f"silent for {now_s - self._heard_s:.0f} s", values)]
         said = f"{rate:.0f} messages/s"
         return [Diagnostic(1 if lost else 0, self.name, f"{said}, some are lost" if lost else said, values)]

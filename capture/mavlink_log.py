@@ -7,7 +7,7 @@ import importlib
 import select
 import socket
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import serial
@@ -20,16 +20,25 @@ from capture.record import MAVLINK_TOPIC, Mavlink
 
 DIALECT = "pymavlink.dialects.v20.ardupilotmega"  # has all of `common`; understands MAVLink 1, too
 _PACKET_BYTES = 65536
+_SAFETY_ARMED = 128  # MAV_MODE_FLAG of a HEARTBEAT's base_mode
+_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a gimbal, whose base_mode says nothing
 
 
 class MavlinkLink:
     """An open port with a decoder behind it."""
 
-    def __init__(self, config: MavlinkConfig, clock: Clock) -> None:
-        """Open it. Raises ``LinkError`` when it is not there or pymavlink is not installed."""
+    def __init__(
+        self, config: MavlinkConfig, clock: Clock, on_heartbeat: Callable[[bool, int], None] | None = None
+    ) -> None:
+        """Open it. ``on_heartbeat`` is told whether an autopilot is armed, and its system's number.
+
+        Raises:
+            LinkError: it is not there or pymavlink is not installed.
+        """
         self.lost: Counter[str] = Counter()
         self._clock = clock
         self._config = config
+        self._on_heartbeat = on_heartbeat
         self._wanted = frozenset(config.messages)
         self._sequence: dict[tuple[int, int], int] = {}
         try:
@@ -67,6 +76,8 @@ class MavlinkLink:
                 self.lost["garbled"] += 1
                 continue
             self._count_gap(message)
+            if self._on_heartbeat and message.get_type() == "HEARTBEAT" and message.autopilot != _NO_AUTOPILOT:
+                self._on_heartbeat(bool(message.base_mode & _SAFETY_ARMED), message.get_srcSystem())
             if message.get_type() in self._wanted:
                 heard.append(Heard(MAVLINK_TOPIC, now_ns, _numbers(message, now_ns).encode()))
         return heard

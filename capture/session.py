@@ -10,8 +10,9 @@ from typing import Protocol
 
 from capture.config import StartConfig
 from capture.control import Answer
-from capture.daemon import RecordingResult, StopRule
-from capture.vitals import IDLE
+from capture.daemon import RecordingResult
+from capture.stop_rule import StopRule
+from capture.vitals import ARMED, IDLE
 
 
 class Recordable(Protocol):
@@ -46,6 +47,7 @@ class Session:
         self._wanted = threading.Event()
         self._quit = threading.Event()
         self._stop = threading.Event()  # of the recording that runs
+        self._begin = threading.Event()  # it waits no longer for what starts it
         self._current: Recordable | None = None
 
     @property
@@ -64,6 +66,9 @@ class Session:
         """Do what the control socket was asked for. It is begun when this returns, not done."""
         current = self._current
         flight = "" if current is None else current.flight
+        if action == "start" and self.state == ARMED:
+            self._begin.set()
+            return Answer(True, ARMED, flight, "starting without what it waits for")
         if action == "start" and current is not None:
             return Answer(False, self.state, flight, "there is a recording already")
         if action == "stop" and current is None:
@@ -104,8 +109,8 @@ class Session:
         return self.results[-1] if self.results else None
 
     def _record(self, triggers: int, duration_s: float) -> bool:
-        """One recording; whether another may follow: it was stopped by command and has not failed."""
-        self._stop = threading.Event()
+        """One recording; whether another may follow: it was ended by command or as it began, and has not failed."""
+        self._stop, self._begin = threading.Event(), threading.Event()
         if self._quit.is_set():  # it came just before
             self._stop.set()
         current = self._make()
@@ -113,11 +118,13 @@ class Session:
         self._wanted.clear()  # a start that came meanwhile meant this one
         self._tell(f"recording {current.flight}")
         try:
-            result = current.run(StopRule(self._stop, triggers, duration_s))
+            result = current.run(StopRule(self._stop, triggers, duration_s, self._begin))
         finally:
             self._current = None
         self.results.append(result)
         self._tell(
             f"{result.flight}: {result.triggers} triggers, {result.recorded} frames recorded, {result.lost} lost"
         )
-        return self._stop.is_set() and not result.failures
+        if result.again and not self._stop.is_set():
+            self._wanted.set()
+        return (self._stop.is_set() or result.again) and not result.failures

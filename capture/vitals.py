@@ -29,8 +29,8 @@ HUNG_DRIVER_S = 2.0
 LOSING_SHARE = 0.01  # of a camera's triggers within the window
 RING_BEHIND_SHARE = 0.5
 MINUTES_LOW, MINUTES_LEAST = 10.0, 2.0
-RUNNING = ("armed", "test burst", "recording")
-IDLE = "idle"
+IDLE, ARMED = "idle", "armed"
+RUNNING = (ARMED, "test burst", "recording")
 _AFTER_ARRIVAL = tuple(stage.name.lower() for stage in (LossStage.RING, LossStage.WRITER, LossStage.DISK))
 
 

@@ -18,20 +18,28 @@ RATE_HZ = 20.0
 _SYSTEM, _COMPONENT = 1, 1
 _HEARTBEAT, _ATTITUDE, _VFR_HUD = (0, 50), (30, 39), (74, 20)  # identifier and CRC_EXTRA of each definition
 
+_ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+
 
 class Autopilot:
     """Sends from a thread of its own, ``autopilot``."""
 
-    def __init__(self, aircraft: Aircraft, where: str, clock: Clock) -> None:
-        """``where`` is ``HOST:PORT``. Raises ``UsageError`` when it is not."""
+    def __init__(self, aircraft: Aircraft, where: str, clock: Clock, armed_s: tuple[float, float] = (0.0, 0.0)) -> None:
+        """``where`` is ``HOST:PORT``; armed from … to … seconds after it was made, or while ``armed`` is set.
+
+        Raises:
+            UsageError: ``where`` is none.
+        """
         host, _, port = where.rpartition(":")
         if not host or not port.isdigit():
             raise UsageError(f"--mavlink {where}: give HOST:PORT, such as 127.0.0.1:14550")
         self.error: BaseException | None = None
         self.sent = 0
+        self.armed = False
         self._to = (host, int(port))
         self._aircraft = aircraft
         self._clock = clock
+        self._armed_s = armed_s
         self._number = 0
         self._booted_ns = clock.utc_ns()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -61,6 +69,12 @@ class Autopilot:
         hud = struct.pack("<4fhH", speed, speed, *altitude, 0, 50)
         return self._packet(_ATTITUDE, attitude), self._packet(_VFR_HUD, hud)
 
+    def heartbeat(self, time_ns: int) -> bytes:
+        """HEARTBEAT at a UTC time: a fixed-wing aircraft flown by ArduPilot, armed or not."""
+        from_s, to_s = self._armed_s
+        armed = self.armed or from_s <= (time_ns - self._booted_ns) * 1e-9 < to_s
+        return self._packet(_HEARTBEAT, struct.pack("<I5B", 0, 1, 3, _ARMED if armed else 0, 4, 3))
+
     def _work(self) -> None:
         try:
             number = 0
@@ -68,7 +82,7 @@ class Autopilot:
                 for packet in self.messages(self._clock.utc_ns()):
                     self._send(packet)
                 if number % round(RATE_HZ) == 0:
-                    self._send(self._packet(_HEARTBEAT, struct.pack("<I5B", 0, 1, 3, 0, 4, 3)))
+                    self._send(self.heartbeat(self._clock.utc_ns()))
                 number += 1
         except BaseException as error:
             self.error = error

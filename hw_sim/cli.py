@@ -75,6 +75,9 @@ def rig(
         ),
     ] = None,
     mavlink: Annotated[str | None, typer.Option(help="HOST:PORT that the autopilot sends MAVLink to, by UDP.")] = None,
+    armed: Annotated[
+        tuple[float, float], typer.Option(help="The autopilot is armed from … to … seconds after the start.")
+    ] = (0.0, 0.0),
 ) -> None:
     """Be the hardware, in real time, until SIGTERM or SIGINT. Says `ready` on standard output when usable.
 
@@ -90,7 +93,7 @@ def rig(
     with contextlib.suppress(OSError):  # real hardware does not wait for the host's other work; take what is allowed
         os.nice(-10)
     clock = SystemClock()
-    hardware = _be(lambda: Rig(known, socket, trigger_port, clock, make_senders(known, clock, can, mavlink)))
+    hardware = _be(lambda: Rig(known, socket, trigger_port, clock, make_senders(known, clock, can, mavlink, armed)))
     for name, counts in hardware.counts().items():
         note(f"{name}: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
     pulses = hardware.pulses

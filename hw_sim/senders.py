@@ -19,8 +19,13 @@ class Sender(Protocol):
         """End."""
 
 
-def make_senders(world: World, clock: Clock, can: str | None, mavlink: str | None) -> list[Sender]:
-    """A CAN node on the bus ``can`` and an autopilot that sends to ``mavlink``; None: without."""
+def make_senders(
+    world: World, clock: Clock, can: str | None, mavlink: str | None, armed_s: tuple[float, float] = (0.0, 0.0)
+) -> list[Sender]:
+    """A CAN node on the bus ``can`` and an autopilot that sends to ``mavlink``; None: without.
+
+    ``armed_s``: the autopilot is armed from … to … seconds from now.
+    """
     aircraft = Aircraft(world)
     senders: list[Sender] = []
     if can is not None:
@@ -30,5 +35,5 @@ def make_senders(world: World, clock: Clock, can: str | None, mavlink: str | Non
     if mavlink is not None:
         from hw_sim.autopilot import Autopilot
 
-        senders.append(Autopilot(aircraft, mavlink, clock))
+        senders.append(Autopilot(aircraft, mavlink, clock, armed_s))
     return senders

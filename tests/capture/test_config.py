@@ -6,9 +6,10 @@ import pytest
 
 from capture.clock import SystemClock
 from capture.config import DRIVER_BUFFERS, load_config
-from capture.daemon import Recording, StopRule
+from capture.daemon import Recording
 from capture.disk import SystemDisk
 from capture.errors import ConfigError, DiskError, UsageError
+from capture.stop_rule import StopRule
 
 
 def test_defaults_and_relative_paths(write_config, tmp_path):

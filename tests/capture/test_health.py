@@ -14,7 +14,7 @@ import pytest
 
 from capture.clock import SystemClock
 from capture.config import load_config
-from capture.daemon import Recording, RecordingResult, StopRule
+from capture.daemon import Recording, RecordingResult
 from capture.disk import SystemDisk
 from capture.errors import CaptureError
 from capture.health import (
@@ -39,6 +39,7 @@ from capture.record import Diagnostic
 from capture.recorder import FrameItem
 from capture.ring import PAGE, Ring
 from capture.segment import SealedFrame
+from capture.stop_rule import StopRule
 from capture.temperatures import host_temperatures_c
 
 PLACES = ["left/cam0", "left/cam1", "right/cam0", "right/cam1"]

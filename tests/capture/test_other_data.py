@@ -28,12 +28,13 @@ from capture.can_log import CanLink
 from capture.clock import SystemClock
 from capture.companions import make_companions
 from capture.config import AnalogChannel, AnalogConfig, CanConfig, MavlinkConfig, load_config
-from capture.daemon import Recording, StopRule
+from capture.daemon import Recording
 from capture.disk import SystemDisk
 from capture.errors import ConfigError, LinkError
 from capture.listener import Heard, Listener
 from capture.mavlink_log import MavlinkLink
 from capture.record import ANALOG_TOPIC, CAN_TOPIC, MAVLINK_TOPIC, Analog, CanFrame, Mavlink
+from capture.stop_rule import StopRule
 from capture.trigger import TriggerBoard
 from capture.trigger_protocol import GarbledLine, Sample, decode_line, encode_line, parse_sample
 from capture.verify import inspect

@@ -12,8 +12,9 @@ from needs import needs_program
 
 from capture.clock import SystemClock
 from capture.config import load_config
-from capture.daemon import Recording, StopRule
+from capture.daemon import Recording
 from capture.disk import SystemDisk
+from capture.stop_rule import StopRule
 
 TRIGGERS = 10
 SCRIPT = Path(__file__).with_name("read_with_mcap_core.mjs")

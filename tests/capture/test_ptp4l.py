@@ -12,13 +12,14 @@ from ptp_pair import PtpPair, ptp_pair
 
 from capture.clock import SystemClock
 from capture.config import PtpConfig, load_config
-from capture.daemon import Recording, StopRule
+from capture.daemon import Recording
 from capture.disk import SystemDisk
 from capture.finding import Situation
 from capture.preflight import check_ptp
 from capture.ptp import PtpWatch, read_ptp
 from capture.record import GATE_TOPIC, PTP_TOPIC, Frame, Gate, Ptp, PtpState
 from capture.scan import scan
+from capture.stop_rule import StopRule
 from capture.verify import inspect
 
 pytestmark = pytest.mark.slow

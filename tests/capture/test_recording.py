@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 
 from capture.clock import SystemClock
 from capture.config import DiskConfig, load_config
-from capture.daemon import Recording, RecordingResult, StopRule
+from capture.daemon import Recording, RecordingResult
 from capture.disk import SystemDisk
 from capture.errors import CameraError, TriggerBoardError, UsageError
 from capture.grabber import Grabber
@@ -23,6 +23,7 @@ from capture.recorder import AUX_QUEUE, FrameItem, Recorder
 from capture.recover import recover_flight
 from capture.ring import PAGE, Ring
 from capture.segment import SmallMessage
+from capture.stop_rule import StopRule
 from capture.trigger import TriggerBoard
 from capture.verify import inspect
 

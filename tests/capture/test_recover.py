@@ -8,10 +8,11 @@ import pytest
 
 from capture.clock import SystemClock
 from capture.config import load_config
-from capture.daemon import Recording, StopRule
+from capture.daemon import Recording
 from capture.disk import SystemDisk
 from capture.errors import RecordingError, UsageError
 from capture.recover import recover_flight
+from capture.stop_rule import StopRule
 from capture.verify import inspect
 
 SLOT = 8192  # of a 64×48 frame

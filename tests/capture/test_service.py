@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from capture.clock import SystemClock
 from capture.config import Config, load_config
-from capture.daemon import Recording, StopRule
+from capture.daemon import Recording
 from capture.disk import SystemDisk
 from capture.journal import REPEAT_PERIOD_S, Changes, Journal, Priority
 from capture.notify import Notifier, journal_listens
 from capture.record import Diagnostic
 from capture.service import Service
+from capture.stop_rule import StopRule
 from capture.watchdog import IDLE, Progress, Watchdog, watchdog_s
 
 

@@ -16,7 +16,7 @@ from capture.burst import Burst, CameraBurst
 from capture.clock import SystemClock
 from capture.config import StartConfig, load_config
 from capture.control import Answer, ControlServer, ask
-from capture.daemon import Recording, StopRule
+from capture.daemon import Recording
 from capture.disk import SystemDisk
 from capture.errors import CameraLost, CaptureError
 from capture.finding import Situation
@@ -25,6 +25,7 @@ from capture.preflight import check_burst
 from capture.record import GATE_TOPIC, Gate
 from capture.scan import scan
 from capture.session import Session
+from capture.stop_rule import StopRule
 from capture.trigger import is_running
 from capture.verify import inspect
 
@@ -41,6 +42,7 @@ def until(condition, seconds: float = 10.0) -> None:
 class Result:
     triggers = recorded = 3
     lost = 0
+    again = False
 
     def __init__(self, flight: str, failures: list[str]) -> None:
         self.flight, self.failures = flight, failures

@@ -14,12 +14,13 @@ from mcap.reader import make_reader
 from capture.aux_log import AuxLog
 from capture.clock import SystemClock
 from capture.config import TriggerConfig, load_config
-from capture.daemon import Recording, RecordingResult, StopRule
+from capture.daemon import Recording, RecordingResult
 from capture.disk import SystemDisk
 from capture.gates import Gates
 from capture.ledger import Ledger
 from capture.record import GATE_TOPIC, Frame, Gate, Trigger, decode_image
 from capture.scan import scan
+from capture.stop_rule import StopRule
 from capture.trigger import TriggerLog
 from capture.trigger_protocol import Pulse
 from capture.trigger_run import TriggerRun

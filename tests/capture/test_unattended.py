@@ -8,11 +8,12 @@ import pytest
 
 from capture.clock import SystemClock
 from capture.config import load_config
-from capture.daemon import Recording, StopRule
+from capture.daemon import Recording
 from capture.disk import SystemDisk
 from capture.errors import CameraError, DiskError, UsageError
 from capture.notify import Notifier
 from capture.service import Service
+from capture.stop_rule import StopRule
 from capture.verify import inspect
 
 TRIGGERS = 150

@@ -11,9 +11,10 @@ import pytest
 
 from capture.clock import SystemClock
 from capture.config import load_config
-from capture.daemon import Recording, StopRule
+from capture.daemon import Recording
 from capture.disk import SystemDisk
 from capture.errors import RecordingError, UsageError
+from capture.stop_rule import StopRule
 from capture.verify import inspect
 
 
