@@ -1,9 +1,9 @@
 """Corners seen in many views to cameras, poses and the board itself: one least-squares adjustment of everything.
 
 Minimises the pixel residuals of all corners in all views of one or two cameras over any of: the intrinsics, the pose
-between the cameras, the board's pose in each view, and the board's own printed corners in its plane. With equal
-independent noise this is maximum likelihood, and its covariance is s² (JᵀJ)⁻¹ (Hartley & Zisserman, Multiple View
-Geometry, 2nd ed., §5.2 and app. 6).
+between the cameras, the board's pose in each view, the board's own printed corners in its plane, and its bow out of
+it. With equal independent noise this is maximum likelihood, and its covariance is s² (JᵀJ)⁻¹ (Hartley & Zisserman,
+Multiple View Geometry, 2nd ed., §5.2 and app. 6).
 """
 
 from dataclasses import dataclass
@@ -37,6 +37,13 @@ class Estimate:
     """(V, 6) rotation and translation of T_cam0_board"""
     board_m: Array
     """(N, 2) corners in the board's plane"""
+    height_m: Array | float = 0.0
+    """(N,) of the corners along the board's z axis, or 0: flat"""
+
+    @property
+    def corners_m(self) -> Array:
+        """(N, 3) corners in the board's frame."""
+        return np.column_stack([self.board_m, np.zeros(len(self.board_m)) + self.height_m])
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,9 @@ class Freedom:
     stereo: bool = True
     board: bool = False
     """The printed corners: 2N − 4 numbers, since the frame and the mean scale stay the nominal board's."""
+    bow_prior_px_per_m: float = 0.0
+    """The board's bow, a quadratic with 3 coefficients, each its height where the board's farthest corner is: the
+    pixels that weigh as much as a metre of one, that is a corner's noise by the prior sigma. 0: flat."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +71,8 @@ class Adjustment:
     """(9C + 6, 9C + 6) of intrinsics and stereo pose; zero for what was held"""
     board_covariance_m2: Array
     """(2N, 2N) of the printed corners; zero if they were held"""
+    height_sigma_m: Array
+    """(N,) of the corners' heights; zero if the board was held flat"""
     sigma_px: float
     """noise of one coordinate, from the residuals"""
     gradient: float
@@ -85,13 +97,14 @@ def adjust(corners_px: Array, start: Estimate, freedom: Freedom) -> Adjustment:
     """
     seen = np.isfinite(corners_px)
     space = _Space(start, freedom, np.asarray(seen.any(axis=(0, 1, 3))))
-    freedoms = int(seen.sum()) - space.zero.size
+    freedoms = int(seen.sum()) + len(space.prior) - space.zero.size
     if freedoms <= 0:
         raise ProcessError("too few corners for this many unknowns; take more views of the board")
     x, evaluations = _minimised(space, corners_px)
     estimate = space.estimate(x)
     whole = residuals_of(estimate, corners_px)
-    residuals, jacobian = whole[seen], space.jacobian(x, seen)
+    residuals = np.concatenate([whole[seen], space.prior @ x])
+    jacobian = np.vstack([space.jacobian(x, seen), space.prior])
     if not np.all(np.isfinite(residuals)):
         raise ProcessError("the adjustment diverged; take more views of the board, tilted in different directions")
     columns = np.linalg.norm(jacobian, axis=0)
@@ -108,12 +121,13 @@ def adjust(corners_px: Array, start: Estimate, freedom: Freedom) -> Adjustment:
     variance = float(length**2 / freedoms)
     half = vectors / np.sqrt(eigenvalues) / columns[:, None]
     covariance = space.to_parameters @ half
-    board = space.to_board @ half
+    board, height = space.to_board @ half, space.to_height @ half
     return Adjustment(
         estimate,
         whole,
         variance * covariance @ covariance.T,
         variance * board @ board.T,
+        np.sqrt(variance * np.sum(height**2, axis=1)),
         float(np.sqrt(variance)),
         gradient,
         evaluations,
@@ -127,9 +141,13 @@ def _minimised(space: "_Space", corners_px: Array) -> tuple[Array, int]:
     it ends, since what ends it is the gradient itself.
     """
     x, damping, seen = space.zero.copy(), 1e-4, np.isfinite(corners_px)
-    residuals = residuals_of(space.estimate(x), corners_px)[seen]
+
+    def residuals_at(x: Array) -> Array:
+        return np.concatenate([residuals_of(space.estimate(x), corners_px)[seen], space.prior @ x])
+
+    residuals = residuals_at(x)
     for evaluation in range(1, MAX_EVALUATIONS):
-        jacobian = space.jacobian(x, seen)
+        jacobian = np.vstack([space.jacobian(x, seen), space.prior])
         if not np.all(np.isfinite(jacobian)):
             return x, evaluation
         columns = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
@@ -138,7 +156,7 @@ def _minimised(space: "_Space", corners_px: Array) -> tuple[Array, int]:
         while True:
             damped = normal + damping * np.eye(len(x))
             step = -np.asarray(solve(damped, gradient, assume_a="pos", check_finite=False)) / columns
-            trial = residuals_of(space.estimate(x + step), corners_px)[seen]
+            trial = residuals_at(x + step)
             if trial @ trial <= residuals @ residuals:
                 break
             damping *= 10.0
@@ -166,23 +184,34 @@ class _Space:
         self._parameters = np.eye(INTRINSICS * cameras + 6)[:, chosen]
         seen = np.ones(len(start.board_m), bool) if seen is None else seen
         self._board = _board_freedom(start.board_m, seen) if freedom.board else np.zeros((start.board_m.size, 0))
-        self._sizes = np.cumsum([len(chosen), start.views.size, self._board.shape[1]])
+        self._bow = _bow_shapes(start.board_m)[:, : 3 if freedom.bow_prior_px_per_m else 0]
+        self._sizes = np.cumsum([len(chosen), start.views.size, self._board.shape[1], self._bow.shape[1]])
         self.zero = np.zeros(self._sizes[-1])
-        blank = np.zeros((len(self._parameters), len(self.zero) - len(chosen)))
-        self.to_parameters = np.hstack([self._parameters, blank])
+        first, second, third, end = self._sizes
+        self.to_parameters = np.zeros((len(self._parameters), end))
         """(9C + 6, len(x)) the cameras' parameters by x"""
-        self.to_board = np.hstack([np.zeros((start.board_m.size, int(self._sizes[1]))), self._board])
+        self.to_parameters[:, :first] = self._parameters
+        self.to_board = np.zeros((start.board_m.size, end))
         """(2N, len(x)) the printed corners by x"""
+        self.to_board[:, second:third] = self._board
+        self.to_height = np.zeros((len(start.board_m), end))
+        """(N, len(x)) the corners' heights by x"""
+        self.to_height[:, third:] = self._bow
+        self.prior = freedom.bow_prior_px_per_m * np.eye(end)[third:]
+        """(·, len(x)) x to further residuals, in px: none, or the bow's"""
+        self.shared = np.r_[:first, second:end]
+        """which of x all views have in common"""
 
     def estimate(self, x: Array) -> Estimate:
         cameras = self._shape[0]
-        change, views, board = np.split(x, self._sizes[:2])
+        change, views, board, bow = np.split(x, self._sizes[:3])
         parameters = self._parameters @ change
         return Estimate(
             self._start.intrinsics + parameters[: INTRINSICS * cameras].reshape(cameras, INTRINSICS),
             self._start.stereo + parameters[INTRINSICS * cameras :],
             self._start.views + views.reshape(-1, 6),
             self._start.board_m + (self._board @ board).reshape(-1, 2),
+            self._start.height_m + self._bow @ bow,
         )
 
     def jacobian(self, x: Array, seen: NDArray[np.bool_] | None = None) -> Array:
@@ -190,14 +219,15 @@ class _Space:
         cameras, views, corners = self._shape
         estimate = self.estimate(x)
         by_all = np.zeros((cameras, views, corners, 2, len(x)))
-        first, second, _ = self._sizes
+        first, second, third, _ = self._sizes
         for camera in range(cameras):
             by_parameters, by_view, by_board = _camera_jacobian(estimate, camera)
             by_all[camera, ..., :first] = by_parameters @ self._parameters
             for view in range(views):
                 by_all[camera, view, ..., first + 6 * view : first + 6 * view + 6] = by_view[view]
             per_corner = self._board.reshape(corners, 2, -1)
-            by_all[camera, ..., second:] = np.einsum("vnij,njk->vnik", by_board, per_corner)
+            by_all[camera, ..., second:third] = np.einsum("vnij,njk->vnik", by_board[..., :2], per_corner)
+            by_all[camera, ..., third:] = by_board[..., 2:] * self._bow[:, None]
         return by_all.reshape(-1, len(x)) if seen is None or seen.all() else by_all[seen]
 
 
@@ -210,6 +240,35 @@ def _board_freedom(board_m: Array, seen: NDArray[np.bool_]) -> Array:
     whole = np.zeros((board_m.size, free.shape[1]))
     whole[np.repeat(seen, 2)] = free
     return whole
+
+
+def _bow_shapes(board_m: Array) -> Array:
+    """(N, 3) heights of a board bent along x, along y and twisted, 1 at the farthest corner's distance."""
+    x, y = (board_m / np.linalg.norm(board_m, axis=1).max()).T
+    return np.stack([x * x, y * y, x * y], axis=1)
+
+
+def view_information(
+    estimate: Estimate, freedom: Freedom, seen: NDArray[np.bool_], board_seen: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """What one view tells of all but its own pose: (S, S) for noise of one pixel, and (9C + 6, S) to parameters.
+
+    ``estimate`` holds that view alone, ``seen`` (C, N) its corners, ``board_seen`` (N,) those of the whole session. The
+    view's pose is eliminated (Schur's complement), so that views add, and ``prior_information`` to them.
+    """
+    space = _Space(estimate, freedom, board_seen)
+    mask = np.repeat(seen[:, None, :, None], 2, axis=-1)
+    jacobian = space.jacobian(space.zero, mask)
+    shared, own = jacobian[:, space.shared], np.delete(jacobian, space.shared, axis=1)
+    cross = own.T @ shared
+    return shared.T @ shared - cross.T @ np.linalg.solve(own.T @ own, cross), space.to_parameters[:, space.shared]
+
+
+def prior_information(estimate: Estimate, freedom: Freedom, board_seen: NDArray[np.bool_]) -> Array:
+    """(S, S) what is known without any view: of the bow only."""
+    space = _Space(estimate, freedom, board_seen)
+    prior = space.prior[:, space.shared]
+    return np.asarray(prior.T @ prior)
 
 
 def residuals_of(estimate: Estimate, corners_px: Array) -> Array:
@@ -227,8 +286,8 @@ def _project(estimate: Estimate, camera: int) -> Array:
 
 def _points(estimate: Estimate, camera: int) -> list[Array]:
     """Corners (V, N, 3): turned into cam0's axes, in cam0; for cam1 also turned into its axes, in cam1."""
-    flat = np.column_stack([estimate.board_m, np.zeros(len(estimate.board_m))])
-    turned = np.stack([flat @ rotation_matrix(view[:3]).T for view in estimate.views])
+    corners = estimate.corners_m
+    turned = np.stack([corners @ rotation_matrix(view[:3]).T for view in estimate.views])
     chain = [turned, turned + estimate.views[:, None, 3:]]
     if camera == 1:
         turned = chain[-1] @ rotation_matrix(estimate.stereo[:3]).T
@@ -237,7 +296,7 @@ def _points(estimate: Estimate, camera: int) -> list[Array]:
 
 
 def _camera_jacobian(estimate: Estimate, camera: int) -> tuple[Array, Array, Array]:
-    """Derivatives of one camera's pixels, (V, N, 2, ·), by all cameras' parameters, the view's pose and the board."""
+    """Derivatives of one camera's pixels, (V, N, 2, ·), by all cameras' parameters, the view's pose and the corners."""
     chain = _points(estimate, camera)
     points = chain[-1]
     by_intrinsics, by_point = _lens_jacobian(points.reshape(-1, 3), estimate.intrinsics[camera])
@@ -252,7 +311,7 @@ def _camera_jacobian(estimate: Estimate, camera: int) -> tuple[Array, Array, Arr
         by_point = by_point @ rotation_matrix(estimate.stereo[:3])
     turns = [_turn_jacobian(chain[0][i], view[:3]) for i, view in enumerate(estimate.views)]
     by_view = np.concatenate([by_point @ np.stack(turns), by_point], axis=-1)
-    axes = np.stack([rotation_matrix(view[:3])[:, :2] for view in estimate.views])
+    axes = np.stack([rotation_matrix(view[:3]) for view in estimate.views])
     return by_parameters, by_view, by_point @ axes[:, None]
 
 

@@ -5,7 +5,7 @@ Two methods. ``paper``: each camera alone (Zhang), then the pose between them wi
 the error that a nominal board leaves in the absolute position.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import cv2
@@ -28,6 +28,7 @@ CORNER_RATIO = 10.0  # times its view's median: a normal error gets there once i
 LEAST_BLUNDER_PX = 0.2
 LEAST_CORNERS = 8  # of a view in each camera
 DISAGREEMENT_RATIO = 6.0  # each camera alone is less sure of a view's distance: they disagree more than they fit
+MOST_STEREO_TO_MONO = 1.5
 SAME_OPTIMUM = 1.0 + 1e-4
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-12)
 
@@ -46,6 +47,8 @@ class CalibrationSettings:
     method: Method = Method.joint
     nominal_board: bool = False
     distortion_terms: int = 5
+    flatness_m: float = 0.0
+    """how far the board may be bowed at its farthest corner, one sigma; 0: it is flat"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +64,8 @@ class Calibration:
     stereo_rms_px: float
     two_stage_rms_px: float
     """of the paper's way: intrinsics held, nominal board"""
+    stereo_to_mono_ratio: float
+    """of that to the cameras alone: near 1 unless the pair moved, or the pictures are not of the same instant"""
     library_rms_px: tuple[float, float, float]
     """where OpenCV's own solvers ended: camera 0, camera 1, stereo with the intrinsics held"""
     sigma_px: float
@@ -71,6 +76,12 @@ class Calibration:
     """(N, 2) printed corners, estimated or nominal"""
     board_sigma_m: Array
     """(N, 2), zero for the nominal board"""
+    estimate: Estimate
+    """all that was found, the views used in their order"""
+    freedom: Freedom
+    """what was free in the last adjustment"""
+    height_sigma_m: Array
+    """(N,) of the corners out of the board's plane, zero for a flat board"""
     residuals_px: Array
     """(2, views, N, 2) of the views used; NaN where a corner was not seen, or left out"""
     used: NDArray[np.intp]
@@ -159,6 +170,7 @@ class _Stages:
     alone: list[Adjustment]
     two_stage: Adjustment
     final: Adjustment
+    freedom: Freedom
     library_rms_px: tuple[float, float, float]
 
 
@@ -181,14 +193,37 @@ def _solve(
     size_px: tuple[int, int],
     settings: CalibrationSettings,
 ) -> _Stages:
-    two_stage = adjust(corners_px, start, Freedom(intrinsics=False))
+    freedom = Freedom(intrinsics=False)
+    two_stage = final = adjust(corners_px, start, freedom)
     stereo_rms_px = _library_stereo_rms_px(corners_px, start, size_px)
-    final = two_stage
     if settings.method is Method.joint:
         board_moves = not settings.nominal_board and corners_px.shape[1] >= MIN_VIEWS_FOR_PRINT
         freedom = Freedom(distortion_terms=settings.distortion_terms, board=board_moves)
         final = adjust(corners_px, two_stage.estimate, freedom)
-    return _Stages([one for one, _ in alone], two_stage, final, (alone[0][1], alone[1][1], stereo_rms_px))
+        if settings.flatness_m > 0.0:
+            for _ in range(2):  # the noise that the prior is weighed against is that of a board that may bow
+                freedom = replace(freedom, bow_prior_px_per_m=final.sigma_px / settings.flatness_m)
+                final = adjust(corners_px, two_stage.estimate, freedom)
+    return _Stages([one for one, _ in alone], two_stage, final, freedom, (alone[0][1], alone[1][1], stereo_rms_px))
+
+
+def refit(corners_px: Array, start: Estimate, calibration: Calibration) -> Adjustment:
+    """The calibration's own method once more, with other corners (2, V, N, 2), from ``start``, near its end.
+
+    Outliers are not looked for. Raises what ``adjust`` does.
+    """
+    start = replace(start, height_m=0.0)  # its prior counts from there
+    if calibration.settings.method is Method.joint:
+        return adjust(corners_px, start, calibration.freedom)
+    freedom = Freedom(distortion_terms=calibration.settings.distortion_terms)
+    between = pose_matrix(start.stereo[:3], start.stereo[3:])
+    from_cam1 = [between @ pose_matrix(view[:3], view[3:]) for view in start.views]
+    views1 = np.array([np.concatenate([cv2.Rodrigues(T[:3, :3])[0].ravel(), T[:3, 3]]) for T in from_cam1])
+    alone = [
+        adjust(corners[None], replace(start, intrinsics=own[None], views=views), freedom)
+        for corners, own, views in zip(corners_px, start.intrinsics, (start.views, views1), strict=True)
+    ]
+    return adjust(corners_px, _join(alone), calibration.freedom)
 
 
 def start_alone(
@@ -264,7 +299,7 @@ def _result(
     final, estimate = stages.final, stages.final.estimate
     joint = settings.method is Method.joint
     # the paper's way leaves the intrinsics out of its last step: that step's covariance alone would be far too small
-    covariance = _with_print_scale(final.covariance, final, board) if joint else None
+    covariance = final.covariance + print_scale_covariance(estimate, board) if joint else None
     cam0, cam1 = (CameraModel.from_intrinsics(*size_px, values) for values in estimate.intrinsics)
     alone = (stages.alone[0].rms_px, stages.alone[1].rms_px)
     in_joint = (rms_px(final.residuals_px[0]), rms_px(final.residuals_px[1]))
@@ -275,11 +310,15 @@ def _result(
         alone_rms_px=alone,
         stereo_rms_px=final.rms_px,
         two_stage_rms_px=stages.two_stage.rms_px,
+        stereo_to_mono_ratio=_stereo_to_mono(stages),
         library_rms_px=stages.library_rms_px,
         sigma_px=final.sigma_px,
         gradient=final.gradient,
         board_m=estimate.board_m,
         board_sigma_m=np.sqrt(np.diag(final.board_covariance_m2)).reshape(-1, 2),
+        estimate=estimate,
+        freedom=stages.freedom,
+        height_sigma_m=final.height_sigma_m,
         residuals_px=final.residuals_px,
         used=used,
         rejected=rejected,
@@ -288,14 +327,18 @@ def _result(
     )
 
 
-def _with_print_scale(covariance: Array, final: Adjustment, board: Board) -> Array:
-    """Add what the corners cannot show: the mean scale of a board whose corners are printed with random errors."""
-    errors = final.estimate.board_m - board.points_m
+def print_scale_covariance(estimate: Estimate, board: Board) -> Array:
+    """(24, 24) what the corners cannot show: the mean scale of a board whose corners are printed with random errors."""
+    errors = estimate.board_m - board.points_m
     moved = np.any(errors != 0.0, axis=1)
     print_variance = float(np.sum(errors**2)) / max(1, 2 * int(moved.sum()) - 4)
     scale_variance = print_variance / float(np.sum(board.points_m[moved] ** 2)) if moved.any() else 0.0
-    translation = np.concatenate([np.zeros(len(covariance) - 3), final.estimate.stereo[3:]])
-    return covariance + scale_variance * np.outer(translation, translation)
+    translation = np.concatenate([np.zeros(estimate.intrinsics.size + 3), estimate.stereo[3:]])
+    return scale_variance * np.outer(translation, translation)
+
+
+def _stereo_to_mono(stages: _Stages) -> float:
+    return stages.two_stage.rms_px / max(float(np.mean([one.rms_px for one in stages.alone])), 1e-9)
 
 
 def _warnings(stages: _Stages, settings: CalibrationSettings, size_px: tuple[int, int], views: int) -> list[str]:
@@ -308,8 +351,8 @@ def _warnings(stages: _Stages, settings: CalibrationSettings, size_px: tuple[int
     ):
         if library > own * SAME_OPTIMUM + 1e-5:  # OpenCV's corners are single precision
             found.append(f"{name} stopped early at {library:.4f} px; the optimum used here has {own:.4f} px")
-    ratio = stages.two_stage.rms_px / max(float(np.mean([one.rms_px for one in stages.alone])), 1e-9)
-    if ratio > 1.5:
+    ratio = _stereo_to_mono(stages)
+    if ratio > MOST_STEREO_TO_MONO:
         found.append(
             f"the stereo residual is {ratio:.1f} times that of the cameras alone: the pair moved, or the pictures "
             "were not taken at the same instant"

@@ -16,16 +16,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from capture.console import note, say, say_json
 from capture.errors import ProcessError, UsageError
 from process.board import Board
-from process.calibrate import CalibrationSettings, Method, calibration_covariance_m2
+from process.calibrate import Calibration, CalibrationSettings, Method, calibration_covariance_m2
+from process.calibration_quality import RANGES_M, Quality, judge
 from process.calibration_recording import find_in_recording
 from process.calibration_report import write_report
 from process.calibration_session import SessionCalibration, calibrate_session, find_session, image_pairs
 from process.camera_model import write_pair
 from process.charuco import dictionary
+from process.cross_validation import FOLDS
 from process.json_file import finite_or_none, provenance
 from process.recording import Recording, open_recording
-
-RANGES_M = (1.0, 2.0, 3.0)
 
 
 def calibrate(
@@ -53,13 +53,25 @@ def calibrate(
     distortion_terms: Annotated[
         int, typer.Option(help="5 (k1 k2 p1 p2 k3), or 2 (k1 k2) for a board that covers little of the image.")
     ] = 5,
-    report: Annotated[Path | None, typer.Option(help="Also write a report (HTML).")] = None,
+    flatness_mm: Annotated[
+        float, typer.Option(help="Also estimate the board's bow, so large at its farthest corner (one sigma); 0: flat.")
+    ] = 0.0,
+    folds: Annotated[
+        int, typer.Option(help="Cross-validation: the views are held out in so many parts, one by one; 0: none.")
+    ] = FOLDS,
+    report: Annotated[
+        Path | None, typer.Option(help="Also write a report (HTML), its figures beside it in NAME_figures.")
+    ] = None,
     workers: Annotated[int, typer.Option(min=1, max=2, help="Processes that look for corners.")] = 2,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Calibrate a camera pair from images, or a recording, of a board seen by both cameras at the same time."""
     if distortion_terms not in (2, 5):
         raise UsageError(f"--distortion-terms {distortion_terms}: 2 or 5")
+    if folds < 0 or folds == 1:
+        raise UsageError(f"--folds {folds}: 2 or more, or 0 for no cross-validation")
+    if not 0.0 <= flatness_mm <= 100.0 or (flatness_mm and method is Method.paper):
+        raise UsageError(f"--flatness-mm {flatness_mm:g}: 0 to 100 mm, and not with --method paper")
     target = _board(board, square_mm, charuco, marker_mm)
     source = _source(flight or [], side, cam0, cam1)
     for path in filter(None, (output, report)):
@@ -70,9 +82,10 @@ def calibrate(
             session = find_session(source, target, workers, progress)
         else:
             session = find_in_recording(*source, target, workers, progress)
-    settings = CalibrationSettings(method, nominal_board, distortion_terms)
+    settings = CalibrationSettings(method, nominal_board, distortion_terms, flatness_mm / 1000.0)
     result = calibrate_session(session, settings)
-    summary = summarise(result, target)
+    quality = judge(result.calibration, result.corners_px, target, folds)
+    summary = summarise(result, target, quality)
     command = shlex.join(["wingproc", *sys.argv[1:]])
     # of a recording the command says which; its files are too large to be hashed here
     made = provenance(command, [path for pair in source for path in pair] if isinstance(source, list) else [])
@@ -86,10 +99,11 @@ def calibrate(
         calibration=summary["calibration"],
         board=summary["board"],
         views=summary["views"],
+        quality=summary["quality"],
     )
     if report is not None:
-        write_report(report, result, target, summary, command)
-    for warning in calibration.warnings:
+        write_report(report, result, quality, target, summary, command)
+    for warning in summary["calibration"]["warnings"]:
         note(f"warning: {warning}")
     if json:
         say_json({**summary, "output": str(output)})
@@ -129,7 +143,7 @@ def _board(size: str, square_mm: float, charuco: str | None, marker_mm: float | 
     return replace(board, charuco=charuco, marker_m=marker_mm / 1000.0)
 
 
-def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
+def summarise(result: SessionCalibration, board: Board, quality: Quality) -> dict[str, Any]:
     """What is printed, and written beside the parameters."""
     calibration = result.calibration
     pair = calibration.pair
@@ -152,6 +166,7 @@ def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
             "distortion_terms": calibration.settings.distortion_terms,
             "alone_rms_px": list(calibration.alone_rms_px),
             "two_stage_rms_px": calibration.two_stage_rms_px,
+            "stereo_to_mono_ratio": calibration.stereo_to_mono_ratio,
             "library_rms_px": list(calibration.library_rms_px),
             "sigma_px": calibration.sigma_px,
             "gradient": calibration.gradient,
@@ -167,8 +182,12 @@ def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
                 }
                 for camera, view, corner, off_px in calibration.odd_corners
             ],
-            "warnings": calibration.warnings,
+            "warnings": [
+                *calibration.warnings,
+                *quality.warnings(calibration.sigma_px, [path.name for path, _ in result.used]),
+            ],
         },
+        "quality": quality.to_dict(),
         "board": {
             "columns": board.columns,
             "rows": board.rows,
@@ -176,6 +195,7 @@ def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
             "estimated": bool(np.any(calibration.board_sigma_m > 0.0)),
             "print_error_rms_m": float(np.sqrt(np.mean(print_error**2))),
             "corners_m": calibration.board_m.tolist(),
+            **_flatness(calibration),
         },
         "views": [
             {"cam0": str(path0), "cam1": str(path1), "used": True, "rms_px": view_rms_px[:, index].tolist()}
@@ -185,6 +205,20 @@ def summarise(result: SessionCalibration, board: Board) -> dict[str, Any]:
             {"cam0": str(path0), "cam1": str(path1), "used": False, "reason": reason}
             for path0, path1, reason in result.rejected
         ],
+    }
+
+
+def _flatness(calibration: Calibration) -> dict[str, Any]:
+    """The board's bow, from the plane that fits it best: peak to valley; None where it was held flat."""
+    if not calibration.freedom.bow_prior_px_per_m:
+        return {"flatness_mm": None, "flatness_sigma_mm": None, "height_m": None}
+    height_m = calibration.estimate.corners_m[:, 2]
+    plane = np.column_stack([calibration.board_m, np.ones(len(height_m))])
+    bent_m = height_m - plane @ np.linalg.lstsq(plane, height_m, rcond=None)[0]
+    return {
+        "flatness_mm": float(1000.0 * np.ptp(bent_m)),
+        "flatness_sigma_mm": float(1000.0 * calibration.height_sigma_m.max()),
+        "height_m": height_m.tolist(),
     }
 
 
@@ -224,11 +258,27 @@ def _print(summary: dict[str, Any], output: Path, report: Path | None) -> None:
     say(f"baseline     {1000 * summary['stereo']['baseline_m']:.3f} mm")
     if summary["board"]["estimated"]:
         say(f"print        corners off their places by {1e6 * summary['board']['print_error_rms_m']:.0f} um RMS")
+    if summary["board"]["flatness_mm"] is not None:
+        say(f"flatness     {summary['board']['flatness_mm']:.3f} mm peak to valley")
     for entry in detail["predicted_sigma_mm"]:
         x, y, z = entry["sigma_xyz_mm"]
         say(f"at {entry['range_m']:g} m       sigma {x:.3f} {y:.3f} {z:.3f} mm (x, y, z of cam0), from the calibration")
+    _print_quality(summary["quality"])
     say(f"optimum      gradient {detail['gradient']:.1e}")
     say(f"written      {output}" + (f", {report}" if report else ""))
+
+
+def _print_quality(quality: dict[str, Any]) -> None:
+    for camera, image in enumerate(quality["images"]):
+        empty = f", no board {', '.join(image['empty'])}" if image["empty"] else ""
+        say(f"coverage     cam{camera} {image['covered_percent']:.0f} % of what both cameras see{empty}")
+    held_out = quality["cross_validation"]
+    if held_out is not None and held_out["rms_px"] is not None:
+        say(f"held out     {held_out['rms_px']:6.4f} px, noise {held_out['noise_ratio']:.2f} times that of the fit")
+    advice = quality["next_view"]
+    if advice is not None:
+        change = f"{advice['worst_sigma_mm']:.2f} to {advice['then_worst_sigma_mm']:.2f} mm"
+        say(f"next view    {advice['text']} (sigma at the worst place: {change})")
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Calibration against known cameras, finite differences and MATLAB's solution of real corners."""
 
+import html
 import json
 import os
 from pathlib import Path
@@ -348,8 +349,42 @@ def test_the_command_calibrates_rendered_images(session_folder, tmp_path):
     sigma_m = np.sqrt(pair.covariance[21, 21])
     assert abs(pair.T_cam1_cam0[0, 3] - PAIR.T_cam1_cam0[0, 3]) < 5 * sigma_m
     assert sigma_m < 2e-3
-    assert "<table>" in report.read_text()
+    check_report(summary, report)
     assert [view["used"] for view in written["views"]] == [True] * 6
+
+
+def check_report(summary, report):
+    """The page, its figures, and its figures of merit."""
+    page = report.read_text()
+    assert "<table>" in page
+    assert "http" not in page  # nothing is loaded from elsewhere
+    figures = {path.stem for path in (report.parent / "report_figures").iterdir()}
+    assert figures == {"residuals", "pattern", "coverage", "uncertainty-image", "uncertainty-range", "views", "print"}
+    assert page.count("data:image/png;base64,") == len(figures)
+    quality = summary["quality"]
+    assert html.escape(quality["next_view"]["text"]) in page
+    assert quality["next_view"]["then_worst_sigma_mm"] < quality["next_view"]["worst_sigma_mm"]
+    assert [entry["range_m"] for entry in quality["uncertainty"]] == [1.0, 2.0, 3.0]
+    assert quality["cross_validation"]["folds"] == 6
+    assert len(quality["cross_validation"]["views"]) == 6
+    assert all(0 < image["covered_percent"] <= 100 for image in quality["images"])
+    assert 0.9 < summary["calibration"]["stereo_to_mono_ratio"] < 1.5
+
+
+def test_the_boards_flatness_and_no_cross_validation_can_be_asked_for(session_folder, tmp_path):
+    output = tmp_path / "pair.json"
+    words = [*arguments(session_folder, output, folds=0, report=tmp_path / "r.html"), "--json"]
+    done = CliRunner().invoke(app, [*words, "--flatness-mm", "0.5"], catch_exceptions=False)
+    assert done.exit_code == 0
+    summary = json.loads(done.stdout)
+    assert summary["quality"]["cross_validation"] is None
+    board = summary["board"]
+    assert 0.0 <= board["flatness_mm"] < 5 * board["flatness_sigma_mm"]  # it was drawn flat
+    assert (tmp_path / "r_figures/flatness.png").stat().st_size > 1000
+    with pytest.raises(UsageError, match="flatness-mm"):
+        CliRunner().invoke(app, [*words, "--flatness-mm", "1", "--method", "paper"], catch_exceptions=False)
+    with pytest.raises(UsageError, match="--folds 1"):
+        CliRunner().invoke(app, arguments(session_folder, output, folds=1), catch_exceptions=False)
 
 
 def test_wrong_board_and_missing_pictures_are_refused(session_folder, tmp_path):
