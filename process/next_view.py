@@ -68,10 +68,10 @@ class NextView:
 def advise(calibration: Calibration, board: Board, points_cam0: Array) -> NextView | None:
     """The pose that lowers most the largest uncertainty of ``points_cam0`` (N, 3), metres.
 
-    None with method ``paper``, which knows no uncertainty, and where the board fits nowhere into both images.
+    None with method ``paper``, which knows no uncertainty, without points, and where no pose is in both images whole.
     """
     candidates = _candidates(calibration.pair, board) if calibration.settings.method is Method.joint else []
-    if not candidates:
+    if not candidates or not len(points_cam0):
         return None
     worst = _Prediction(calibration, board, points_cam0)
     now_mm = worst.sigma_mm(None)

@@ -161,6 +161,7 @@ def test_advice_names_the_side_that_is_missing_and_keeps_its_promise():
     result = calibrate(see(seen, 10), BOARD, SIZE)
     points = grid_points()
     advice = advise(result, BOARD, points)
+    assert advise(result, BOARD, points[:0]) is None
     assert "right" in advice.place
     assert "right" in advice.text
     assert f"{advice.range_m:.1f} m" in advice.text
