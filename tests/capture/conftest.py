@@ -99,7 +99,8 @@ class FakeCamera(Camera):
                 slot, buffer = self._buffers.get(timeout=0.1)
             except queue.Empty:  # its read thread hangs: the driver has nowhere to put the frame
                 return
-            buffer[:] = memoryview(pixels_of(self.address, index))
+            pixels = pixels_of(self.address, index)
+            buffer[: len(pixels)] = memoryview(pixels)
             ready_ns = now_ns + self.settings.exposure_us * 1000 + ROW_TIME_NS * HEIGHT
             status = FrameStatus.INCOMPLETE if key in self.rig.incomplete else FrameStatus.COMPLETE
             ticks = now_ns - self._zero_ns

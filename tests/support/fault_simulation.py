@@ -203,7 +203,8 @@ class SimulatedCamera(Camera):
         if not self.buffers:
             return False
         slot, buffer = self.buffers.popleft()
-        buffer[:] = content(self.place, index)
+        pixels = content(self.place, index)
+        buffer[: len(pixels)] = pixels
         ticks = round((edge_ns - self.zero_ns) * self.drift)
         self.due.append(Grab(slot, self.frame_id, ticks, ready_ns, EXPOSURE_US, 0.0, status))
         return True
