@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= demo-out
+TESTS ?= tests
 STAMP := $(VENV)/.installed
 PEERS := $(VENV)/.installed-peers
 
@@ -34,7 +35,7 @@ test-vm: $(STAMP) # drivers and power cuts on a Debian kernel in QEMU
 	$(BIN)/pytest tests/vm
 
 slow: $(PEERS)
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest -m slow $(TESTS)
 
 docs: $(STAMP)
 	$(BIN)/python tests/support/command_reference.py
