@@ -138,7 +138,7 @@ def pixels_shifted(patch):
     def shifted(self, slot):
         return slot[self.pixels_at + 1 : self.pixels_at + 1 + self.pixels_size]
 
-    patch.setattr(FrameLayout, "pixels", shifted)
+    patch.setattr(FrameLayout, "buffer", shifted)
 
 
 def sets_torn(patch):
