@@ -22,8 +22,11 @@ $(PEERS): $(STAMP)
 demo: $(STAMP)
 	$(BIN)/wingsim demo -o $(OUT)
 
+# what only computes runs on all cores; what keeps time runs alone
+COMPUTING := tests/process tests/reconstruct tests/project
 test: $(STAMP) lint
-	$(BIN)/pytest -m "not slow"
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m "not slow" --numprocesses auto --dist loadfile $(COMPUTING) --ignore tests/process/monitor
+	$(BIN)/pytest -m "not slow" $(filter-out $(COMPUTING),$(wildcard tests/*)) tests/process/monitor
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -6,13 +6,13 @@ Packed here by hand (https://mavlink.io/en/guide/serialization.html), so that wh
 import contextlib
 import socket
 import struct
-import threading
 
 import numpy as np
 
 from capture.clock import Clock
 from capture.errors import UsageError
 from hw_sim.aircraft import Aircraft
+from hw_sim.senders import Sender
 
 RATE_HZ = 20.0
 _SYSTEM, _COMPONENT = 1, 1
@@ -21,7 +21,7 @@ _HEARTBEAT, _ATTITUDE, _VFR_HUD = (0, 50), (30, 39), (74, 20)  # identifier and 
 _ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 
 
-class Autopilot:
+class Autopilot(Sender):
     """Sends from a thread of its own, ``autopilot``."""
 
     def __init__(self, aircraft: Aircraft, where: str, clock: Clock, armed_s: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -33,8 +33,7 @@ class Autopilot:
         host, _, port = where.rpartition(":")
         if not host or not port.isdigit():
             raise UsageError(f"--mavlink {where}: give HOST:PORT, such as 127.0.0.1:14550")
-        self.error: BaseException | None = None
-        self.sent = 0
+        super().__init__("autopilot")
         self.armed = False
         self._to = (host, int(port))
         self._aircraft = aircraft
@@ -43,18 +42,10 @@ class Autopilot:
         self._number = 0
         self._booted_ns = clock.utc_ns()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="autopilot", daemon=True)
-
-    def start(self) -> None:
-        """Begin to send."""
-        self._thread.start()
 
     def close(self) -> None:
         """No message after this returns."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(5.0)
+        super().close()
         self._socket.close()
 
     def messages(self, time_ns: int) -> tuple[bytes, bytes]:
@@ -76,16 +67,13 @@ class Autopilot:
         return self._packet(_HEARTBEAT, struct.pack("<I5B", 0, 1, 3, _ARMED if armed else 0, 4, 3))
 
     def _work(self) -> None:
-        try:
-            number = 0
-            while not self._stop.wait(1.0 / RATE_HZ):
-                for packet in self.messages(self._clock.utc_ns()):
-                    self._send(packet)
-                if number % round(RATE_HZ) == 0:
-                    self._send(self.heartbeat(self._clock.utc_ns()))
-                number += 1
-        except BaseException as error:
-            self.error = error
+        number = 0
+        while not self._stop.wait(1.0 / RATE_HZ):
+            for packet in self.messages(self._clock.utc_ns()):
+                self._send(packet)
+            if number % round(RATE_HZ) == 0:
+                self._send(self.heartbeat(self._clock.utc_ns()))
+            number += 1
 
     def _send(self, packet: bytes) -> None:
         with contextlib.suppress(OSError):  # nobody listens

@@ -8,7 +8,6 @@ frames are packed here by hand, so that what decodes them is not what encoded th
 import contextlib
 import os
 import struct
-import threading
 import tty
 from importlib.resources import files
 from pathlib import Path
@@ -19,6 +18,7 @@ import can
 from capture.clock import Clock
 from capture.errors import SimulationError, UsageError
 from hw_sim.aircraft import Aircraft, AircraftState
+from hw_sim.senders import Sender
 
 BITRATE = 500_000
 _PERIODS_NS = {256: 10_000_000, 257: 40_000_000, 258: 20_000_000}  # by identifier
@@ -29,7 +29,7 @@ def dbc_text() -> str:
     return files("hw_sim").joinpath("xhale.dbc").read_text(encoding="utf-8")
 
 
-class CanNode:
+class CanNode(Sender):
     """Sends from a thread of its own, ``can-node``."""
 
     def __init__(self, aircraft: Aircraft, where: str, clock: Clock) -> None:
@@ -41,36 +41,24 @@ class CanNode:
         interface, colon, channel = where.partition(":")
         if not colon or not channel:
             raise UsageError(f"--can {where}: give INTERFACE:CHANNEL, such as slcan:/tmp/can or socketcan:vcan0")
-        self.error: BaseException | None = None
-        self.sent = 0
+        super().__init__("can-node")
         self._aircraft = aircraft
         self._clock = clock
         self._counter = 0
         self._bus: _Bus = _SerialAdapter(Path(channel)) if interface == "slcan" else _PythonCan(interface, channel)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="can-node", daemon=True)
-
-    def start(self) -> None:
-        """Begin to send."""
-        self._thread.start()
 
     def close(self) -> None:
         """No frame after this returns; the bus is gone."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(5.0)
+        super().close()
         self._bus.close()
 
     def _work(self) -> None:
         due_ns = dict.fromkeys(_PERIODS_NS, self._clock.utc_ns())
-        try:
-            while not self._stop.wait(max((min(due_ns.values()) - self._clock.utc_ns()) * 1e-9, 0.0)):
-                for number in [number for number, due in due_ns.items() if due <= self._clock.utc_ns()]:
-                    self._bus.send(number, self._content(number, self._aircraft.at(self._clock.utc_ns())))
-                    self.sent += 1
-                    due_ns[number] += _PERIODS_NS[number]
-        except BaseException as error:
-            self.error = error
+        while not self._stop.wait(max((min(due_ns.values()) - self._clock.utc_ns()) * 1e-9, 0.0)):
+            for number in [number for number, due in due_ns.items() if due <= self._clock.utc_ns()]:
+                self._bus.send(number, self._content(number, self._aircraft.at(self._clock.utc_ns())))
+                self.sent += 1
+                due_ns[number] += _PERIODS_NS[number]
 
     def _content(self, number: int, state: AircraftState) -> bytes:
         if number == 256:

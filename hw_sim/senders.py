@@ -1,22 +1,41 @@
 """A world to what sends beside the cameras: the CAN node and the autopilot, as far as they are asked for."""
 
-from typing import Protocol
+import threading
+from abc import ABC, abstractmethod
 
 from capture.clock import Clock
 from hw_sim.aircraft import Aircraft
 from hw_sim.world import World
 
 
-class Sender(Protocol):
+class Sender(ABC):
     """Sends from a thread of its own, between ``start`` and ``close``."""
 
-    error: BaseException | None
+    def __init__(self, name: str) -> None:
+        self.error: BaseException | None = None
+        self.sent = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Begin to send."""
+        self._thread.start()
 
     def close(self) -> None:
-        """End."""
+        """Nothing is sent after this returns. Makers of more let go of it then."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(5.0)
+
+    @abstractmethod
+    def _work(self) -> None:
+        """Send until ``_stop`` is set."""
+
+    def _run(self) -> None:
+        try:
+            self._work()
+        except BaseException as error:
+            self.error = error
 
 
 def make_senders(

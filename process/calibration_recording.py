@@ -1,8 +1,6 @@
 """A recording in which a board was held before a pair to a session of views: sets looked at, still ones, far apart."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -13,7 +11,7 @@ from capture.errors import ProcessError
 from process.board import Board, View
 from process.calibration_session import Session, find_board
 from process.recording import FrameSetReader, Recording, SetPlaces
-from process.workers import worker_environment
+from process.workers import in_order
 
 Array = NDArray[np.float64]
 
@@ -46,7 +44,7 @@ def find_in_recording(
     jobs = [(sets[k], sets[k + 1] if k + 1 < len(sets) else None, board) for k in chosen]
     views: list[tuple[View, View]] = []
     size_px = (0, 0)
-    for done, (first, second, size) in enumerate(_map(jobs, workers), 1):
+    for done, (first, second, size) in enumerate(in_order(_find_set, jobs, workers), 1):
         size_px = size
         if first.corners and second.corners:
             views.append((first, second))
@@ -58,14 +56,6 @@ def find_in_recording(
             "second in each of fifteen places"
         )
     return Session(board, size_px, [views[k] for k in _far_apart(views)])
-
-
-def _map(jobs: list[_Job], workers: int) -> Iterator[tuple[View, View, tuple[int, int]]]:
-    if workers == 1:
-        yield from map(_find_set, jobs)
-        return
-    with worker_environment(), ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        yield from pool.map(_find_set, jobs)
 
 
 def _find_set(job: _Job) -> tuple[View, View, tuple[int, int]]:

@@ -1,12 +1,9 @@
 """Two sets of board images to the views both cameras measured well: files in, corners and reasons out."""
 
 import glob
-import os
 import re
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -26,6 +23,7 @@ from process.calibrate import (
     start_alone,
 )
 from process.charuco import find_charuco
+from process.workers import in_order
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -121,7 +119,7 @@ def find_session(
     """Find the board in all images. ProcessError for a file that cannot be used, or of another size than the first."""
     jobs = [(path, board) for pair in pairs for path in pair]
     found: list[tuple[View, tuple[int, int]]] = []
-    for done, result in enumerate(_map(jobs, workers), 1):
+    for done, result in enumerate(in_order(_find_one, jobs, workers), 1):
         found.append(result)
         progress(done, len(jobs))
     width, height = found[0][1]
@@ -133,16 +131,6 @@ def find_session(
             )
     views = [view for view, _ in found]
     return Session(board, (width, height), list(zip(views[0::2], views[1::2], strict=True)))
-
-
-def _map(jobs: Sequence[tuple[Path, Board]], workers: int):  # type: ignore[no-untyped-def]
-    if workers == 1:
-        yield from map(_find_one, jobs)
-        return
-    # a worker's products are small: a BLAS that spreads them over threads would only wait
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(_find_one, jobs)
 
 
 def _find_one(job: tuple[Path, Board]) -> tuple[View, tuple[int, int]]:

@@ -84,6 +84,15 @@ def worker_environment() -> Iterator[None]:
                 os.environ[name] = value
 
 
+def in_order(function: Callable[[J], R], jobs: Iterable[J], workers: int) -> Iterator[R]:
+    """Results in the order of the jobs, by so many processes; with 1 in this one. Raises what ``function`` raises."""
+    if workers == 1:
+        yield from map(function, jobs)
+        return
+    with worker_environment(), ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        yield from pool.map(function, jobs)
+
+
 @contextmanager
 def crew(workers: int, scheduler: str | None = None, modules: tuple[str, ...] = ()) -> Iterator[Crew]:
     """A crew, ready to work: ``modules`` are loaded.

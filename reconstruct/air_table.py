@@ -71,7 +71,7 @@ def air_table(wing: Wing, shape_path: Path, frames: pa.Table, force: SpecificFor
         own = np.asarray(pc.equal(frames.column("side"), side).to_numpy(zero_copy_only=False))
         if not own.any():
             continue
-        half = wing.left if side == "left" else wing.right
+        half = wing.half(side)
         sets = frames.filter(pa.array(own))
         nodes = len(half.node_s_m)
         places = shape.filter(pc.equal(shape.column("side"), side))

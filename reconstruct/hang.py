@@ -83,8 +83,9 @@ def hang(half: HalfWing, tip_m: Array, sigma_tip_m: Array) -> Hang | None:
     if model_m < LEAST_HANG_SIGMAS * sigma_m or model_m == 0.0:
         return None
     softer, slope_m = 0.0, model_m
+    here: Array | None = model
     for _ in range(_ROUNDS):
-        here, beside = _tip_m(half, softer), _tip_m(half, softer + _STEP)
+        beside = _tip_m(half, softer + _STEP)
         if here is None or beside is None:
             return None
         slope_m = float(direction @ (beside - here)) / _STEP
@@ -92,6 +93,7 @@ def hang(half: HalfWing, tip_m: Array, sigma_tip_m: Array) -> Hang | None:
         softer = max(_STIFFEST, softer + change)
         if abs(change) < _STEP:
             break
+        here = _tip_m(half, softer)
     return Hang(
         half.side,
         measured_m,
@@ -107,7 +109,7 @@ def recorded_hangs(wing: Wing, wings: pa.Table) -> list[Hang]:
     """Of the wings whose displacements are counted from a recorded shape; ``wings`` is unloaded.parquet."""
     found = []
     for row in wings.to_pylist():
-        half = wing.left if row["side"] == "left" else wing.right
+        half = wing.half(row["side"])
         if row["reference"] != UNLOADED_WING and row["station"] == len(half.node_s_m) - 1:
             tip, sigma = (np.array([row[prefix + name] for name in REFERENCE_POSITION]) for prefix in ("", "sigma_"))
             found.append(hang(half, tip, sigma))

@@ -38,7 +38,6 @@ from reconstruct.reference import Reference
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_result
 from reconstruct.scene import SCENE, write_scene
-from reconstruct.series import half_of
 from reconstruct.shared import SharedError, shared_errors
 from reconstruct.stages import Cameras, FitPlan, Key, fit, measure, sampled, take
 from reconstruct.summary import holes, summarise
@@ -305,7 +304,7 @@ def _warnings(wing: Wing, sample: Mapping[str, MarkerSeries]) -> list[str]:
             if known[:, marker].any():
                 cov[marker] = np.median(series.cov_m2[:, marker][known[:, marker]], axis=0)
         if np.isfinite(cov[:, 0, 0]).sum() >= FEWEST_MARKERS:
-            said.update(dict.fromkeys(identify(half_of(wing, side), wing.fit, cov).warnings))
+            said.update(dict.fromkeys(identify(wing.half(side), wing.fit, cov).warnings))
     return list(said)
 
 

@@ -163,7 +163,7 @@ def fit_series(
         ProcessError: a worker process died.
     """
     given = instants or InstantSettings()
-    whole = {side: as_in(half_of(wing, side), series) for side, series in markers.items()}
+    whole = {side: as_in(wing.half(side), series) for side, series in markers.items()}
     if not any(measured_markers(series).any() for series in whole.values()):
         raise UsageError(NOTHING_MEASURED)
     start_ns = min(int(series.frame_timestamp_ns.min()) for series in whole.values())
@@ -207,7 +207,7 @@ def fit_how(
         raise UsageError(f"the wing {wing.name!r} has no [fit] section: say where its loads act (load_stations_m)")
     if smooth_s > 0 and wing.fit.loads != "everywhere":
         raise UsageError('smoothing in time needs loads = "everywhere" in the wing file\'s [fit]')
-    return FitHow(half_of(wing, side), wing.fit, instants, smooth_s, shared, rig=rig)
+    return FitHow(wing.half(side), wing.fit, instants, smooth_s, shared, rig=rig)
 
 
 def stretches(series: MarkerSeries, around_s: float) -> list[Stretch]:
@@ -283,11 +283,6 @@ def prior_scale(how: FitHow, observed: Observed) -> Floats | None:
 def picks(count: int) -> Ints:
     """Which of ``count`` sets with enough markers the prior's scale is chosen from: SCALE_SETS, spread evenly."""
     return np.unique(np.linspace(0, count - 1, SCALE_SETS).round().astype(np.int64)) if count else np.empty(0, np.int64)
-
-
-def half_of(wing: Wing, side: str) -> HalfWing:
-    """The half wing of that name."""
-    return wing.left if side == "left" else wing.right
 
 
 def joined(parts: list[SideFits]) -> SideFits:

@@ -27,7 +27,6 @@ from reconstruct.series import (
     as_in,
     fit_how,
     fit_stretch,
-    half_of,
     picks,
     prior_scale,
     reference_shape,
@@ -270,7 +269,7 @@ def _series(key: Key, wing: Wing, store: PartStore, name: str, cameras: Cameras 
         if key.side not in cameras.sides:
             raise UsageError(f"{name}: does not say which cameras saw the {key.side} wing; leave --direct out")
         series = with_centroids(series, table, cameras.sides[key.side], cameras.layout, name)
-    return as_in(half_of(wing, key.side), series)
+    return as_in(wing.half(key.side), series)
 
 
 def _scale(job: _ScaleJob) -> Floats | None:

@@ -1,7 +1,7 @@
 """A wing file and a loads file into the wing's static shape: the ``reconstruct static`` command."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -28,9 +28,8 @@ def static(
     """
     if side not in ("left", "right"):
         raise typer.BadParameter("give left or right", param_hint="--side")
-    which: Literal["left", "right"] = "left" if side == "left" else "right"
     described = read_loads(loads)
-    half = read_wing(wing, described.stations_m).half(which)
+    half = read_wing(wing, described.stations_m).half(side)
     acting = loads_on(half, described)
     found = solve(half.beam, acting)
     if not found.converged:

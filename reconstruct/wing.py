@@ -96,7 +96,7 @@ class Wing:
     right: HalfWing
     fit: FitSettings
 
-    def half(self, side: Side) -> HalfWing:
+    def half(self, side: str) -> HalfWing:
         """The half wing of that name."""
         return self.left if side == "left" else self.right
 

@@ -6,6 +6,7 @@ Blurred discs are integrated here by brute force; whole wings come from the simu
 import json
 import signal
 import subprocess
+import threading
 import time
 
 import cv2
@@ -174,14 +175,26 @@ def test_previews_of_a_recorder(tmp_path):
     while ring.free < 2:
         time.sleep(0.01)
     camera = CameraHealth("left", "cam0", 8, {}, 25.0, 0.0, 2, 2, 2, exposure_us=2500)
-    health = Health(
-        "f", "recording", 1.0, 8, 25.0, (camera,), (), (), previews=("left/cam0",),
-        written_monotonic_s=time.monotonic() + 1.0,
-    )  # fmt: skip
-    while health.written_monotonic_s > time.monotonic():
-        time.sleep(0.05)
-    write_health(tmp_path, health)
+    ended = threading.Event()
+
+    def write_healths():
+        while not ended.wait(0.2):  # as a recorder does: one that is old counts for nothing
+            written_s = time.monotonic()
+            write_health(
+                tmp_path,
+                Health(
+                    "f", "recording", 1.0, 8, 25.0, (camera,), (), (), previews=("left/cam0",),
+                    written_monotonic_s=written_s,
+                ),
+            )  # fmt: skip
+
+    recorder = threading.Thread(target=write_healths)
+    recorder.start()
+    while read_health(tmp_path) is None:
+        time.sleep(0.01)
     answer = aim("--health", tmp_path, "--expected", 12, "--json")
+    ended.set()
+    recorder.join()
     writer.stop(5)
     (found,) = json.loads(answer.stdout)
     assert (found["camera"], found["markers"], found["exposure_us"], found["good"]) == ("left/cam0", 12, 2500, True)
