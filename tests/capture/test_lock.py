@@ -1,5 +1,6 @@
 """Two recorders never share a disk, and a lock never outlives its process."""
 
+import os
 import subprocess
 import sys
 
@@ -50,7 +51,7 @@ def test_a_killed_holder_holds_nothing(disks, other):
     other.kill()
     other.wait()
     with sole_recorder(disks):
-        pass
+        assert recorder_at(disks[0]) == os.getpid()
 
 
 def test_a_disk_that_is_not_there_is_passed_over(tmp_path):

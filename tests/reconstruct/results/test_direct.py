@@ -9,9 +9,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from mounted_pair import mounted
 
 from capture.errors import UsageError
-from process.camera_model import CameraModel, Light, MarkerLayout, Rig, RigSide, StereoPair
+from process.camera_model import Light, MarkerLayout, Rig, RigSide, StereoPair
 from process.shared_error import with_rig
 from process.tables import DIRECT_COLUMNS, MARKER_SCHEMA
 from process.triangulate import triangulate
@@ -20,22 +21,6 @@ from reconstruct.run import Job, run_job
 SIGMA_PX = 0.2  # far above a centroid's, so that errors are of millimetres
 ROW_TIME_NS = 10_000.0
 SETS = 60  # over a cut between blocks
-
-
-def mounted(out: float) -> RigSide:
-    """A pair on the fuselage that looks along the wing of side ``out`` (+1 right), pitched 8° up; 0.28 m apart."""
-    pitch = np.radians(8.0)
-    forward, right = np.array([0.0, out * np.cos(pitch), np.sin(pitch)]), np.array([out, 0.0, 0.0])
-    T_body_cam0 = np.eye(4)
-    T_body_cam0[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    T_body_cam0[:3, 3] = np.array([0.03, -out * 0.2, 0.08]) - 0.14 * right
-    T_cam1_cam0 = np.eye(4)
-    T_cam1_cam0[:3, :3] = cv2.Rodrigues(np.array([0.003, 0.008, -0.005]))[0]
-    T_cam1_cam0[:3, 3] = [-0.2794, 0.002, -0.001]
-    camera = CameraModel(
-        2080, 1552, np.array([[1400.0, 0, 1040], [0, 1400, 776], [0, 0, 1]]), np.array([-0.1, 0.02, 3e-4, -2e-4, 0])
-    )
-    return RigSide(StereoPair(camera, camera, T_cam1_cam0), T_body_cam0, "0", "1", ROW_TIME_NS)
 
 
 def image_of(side: RigSide, camera: int, points_m: np.ndarray) -> np.ndarray:
@@ -53,7 +38,7 @@ class Flight:
         self.wing, self.times_s = wing, np.arange(SETS) * 0.04
         self.start_ns = 1_700_000_000_000_000_000
         layout = MarkerLayout(stations_m, chord_m, 0.0, Light())
-        self.rig = Rig(mounted(-1.0), mounted(1.0), layout)
+        self.rig = Rig(mounted(-1.0, ROW_TIME_NS), mounted(1.0, ROW_TIME_NS), layout)
         rng = np.random.default_rng(seed)
         parts = [self._side("right", rng, hidden)]
         self.table = with_rig(pa.concat_tables(parts), self.rig)
