@@ -75,9 +75,9 @@ def assert_same_bytes(one: Path, other: Path) -> None:
                 assert (one / f"{name}.{kind}").read_bytes() == (other / f"{name}.{kind}").read_bytes(), name
 
 
-def test_the_shapes_are_the_wings(flight, alone, tmp_path):
+def assert_true_shapes(out: Path, flight: Path, scratch: Path) -> None:
     answer = subprocess.run(
-        [executable("reconstruct"), "compare", str(alone), str(flight / "truth"), "-o", str(tmp_path), "--json"],
+        [executable("reconstruct"), "compare", str(out), str(flight / "truth"), "-o", str(scratch), "--json"],
         capture_output=True, text=True, timeout=100,
     )  # fmt: skip
     assert answer.returncode == 0, answer.stderr
@@ -85,6 +85,10 @@ def test_the_shapes_are_the_wings(flight, alone, tmp_path):
     assert said["frames_compared"] == 2 * SECONDS * 25
     assert said["shape_rms_mm"] < 1.0
     assert said["twist_rms_deg"] < 0.2
+
+
+def test_the_shapes_are_the_wings(flight, alone, tmp_path):
+    assert_true_shapes(alone, flight, tmp_path)
 
 
 @pytest.mark.slow
@@ -100,15 +104,7 @@ def test_by_both_cameras_pixels_too(flight, tmp_path):
     process.wait()
     out = reconstruct(flight, folder, "--direct", "--workers", 2)
     assert json.loads((out / "summary.json").read_text())["direct"] is True
-    answer = subprocess.run(
-        [executable("reconstruct"), "compare", str(out), str(flight / "truth"), "-o", str(tmp_path), "--json"],
-        capture_output=True, text=True, timeout=100,
-    )  # fmt: skip
-    assert answer.returncode == 0, answer.stderr
-    said = json.loads(answer.stdout)
-    assert said["frames_compared"] == 2 * SECONDS * 25
-    assert said["shape_rms_mm"] < 1.0
-    assert said["twist_rms_deg"] < 0.2
+    assert_true_shapes(out, flight, tmp_path)
 
 
 def test_the_summary_says_how_fast_and_how_large(alone):
