@@ -16,7 +16,7 @@ from capture.clock import SystemClock
 from capture.console import note, run, say
 from capture.errors import UsageError
 from hw_sim.demo import demo
-from hw_sim.world import World
+from hw_sim.world import FUSELAGE_LIGHTS, MountMotion, World
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Simulated cameras, trigger board and wing.")
 
@@ -36,9 +36,32 @@ def world(
     scale: Annotated[int, typer.Option(help="Divides the image size: 1, 2, 4, 8, 16.")] = 1,
     background: Annotated[str, typer.Option(help="dark or sunlit.")] = "dark",
     finish: Annotated[str, typer.Option(help="Of the wing: matt or clean.")] = "matt",
+    leds: Annotated[str, typer.Option(help="On the wing: disc, or dome (bulbs that stand off the wing).")] = "disc",
+    fuselage_lights: Annotated[
+        bool, typer.Option("--fuselage-lights", help="Six reference lights a side, on in the survey and in flight.")
+    ] = False,
+    mount_drift: Annotated[
+        tuple[float, float], typer.Option(help="Amplitudes of the camera pairs' slow motion, mm and mrad.")
+    ] = (0.0, 0.0),
+    mount_vibration: Annotated[
+        tuple[float, float], typer.Option(help="Amplitudes of the camera pairs' vibration, mm and mrad.")
+    ] = (0.0, 0.0),
 ) -> None:
     """Write a world: cameras, lights, sensor, wing motion. It is the truth; keep it from the measuring commands."""
-    made = World.make(seed, scale, background, finish)
+    made = World.make(
+        seed,
+        scale,
+        background,
+        finish,
+        form=leds,
+        fuselage=FUSELAGE_LIGHTS if fuselage_lights else None,
+        mount_motion=MountMotion(
+            drift_mm=mount_drift[0],
+            drift_mrad=mount_drift[1],
+            vibration_mm=mount_vibration[0],
+            vibration_mrad=mount_vibration[1],
+        ),
+    )
     made.write(out)
     say(f"{out}: seed {seed}, {made.sensor.width_px}×{made.sensor.height_px}, {background}, {finish}")
 

@@ -68,15 +68,18 @@ def write_sessions(
 
 
 def survey_points(world: World, side: str) -> Array:
-    """True places (n, 3) of one side's surveyed lights, body frame: spread from 0.5 to 3 m outboard, fore and aft of
-    the pair's middle, −0.1 to 0.7 m high, in view of both cameras and well apart in both images."""
+    """True places (n, 3) of one side's surveyed lights, body frame: those of the fuselage, then others on stands.
+
+    The latter are spread from 0.5 to 3 m outboard, fore and aft of the pair's middle, −0.1 to 0.7 m high, in view of
+    both cameras and well apart in both images.
+    """
     rng = np.random.default_rng([world.seed, 0x5E, *side.encode()])
     pair = [world.camera(side, name) for name in CAMERAS]
     outboard = 1.0 if side == "right" else -1.0
     size = np.array([world.sensor.width_px, world.sensor.height_px])
     apart = 0.03 * world.sensor.width_px
-    points: list[Array] = []
-    seen: list[Array] = []
+    points: list[Array] = list(world.fuselage_lights_m(side))
+    seen = [np.array([optics.project(camera, point) for camera in pair]) for point in points]
     for number, out in enumerate(np.linspace(0.5, 3.0, world.survey.points)):
         while True:
             x = world.mount.centre_x_m + (1 if number % 2 else -1) * rng.uniform(0.05, 0.35)
@@ -106,6 +109,10 @@ def survey_toml(world: World) -> str:
         f"chord_m = {list(leds.chord_m)}",
         f"height_m = {leds.height_m!r}",
     ]
+    if leds.form == "dome":
+        sizes = {"standoff": leds.height_m, "dome_radius": leds.diameter_m / 2.0}
+        lines += [f"{name}_mm = {1000.0 * size:g}" for name, size in sizes.items()]
+        lines += ["standoff_sigma_mm = 0.2", "dome_sigma_mm = 0.1"]
     for side in SIDES:
         middle = np.mean([nominal_pose(world.mount, side, name)[:3, 3] for name in CAMERAS], axis=0)
         look = nominal_pose(world.mount, side, "cam0")[:3, 2]
@@ -115,9 +122,13 @@ def survey_toml(world: World) -> str:
         lines += [f"approx_position_m = {_numbers(middle)}", f"approx_outboard = {_numbers(look)}"]
         rng = np.random.default_rng([world.seed, 0x5E77, *side.encode()])
         points = survey_points(world, side)
+        on_fuselage = len(world.fuselage.lights_m)
         for number, point in enumerate(points + rng.normal(0.0, world.survey.sigma_m, points.shape)):
-            lines += ["", f"[[{side}.points]]", f'name = "{side[0].upper()}{number + 1:02d}"']
+            fixed = number < on_fuselage
+            name = f"F{number + 1}" if fixed else f"{number - on_fuselage + 1:02d}"
+            lines += ["", f"[[{side}.points]]", f'name = "{side[0].upper()}{name}"']
             lines += [f"xyz_m = {_numbers(point)}", f"sigma_mm = {sigma_mm:g}"]
+            lines += ["on_fuselage = true"] if fixed else []
     return "\n".join(lines) + "\n"
 
 

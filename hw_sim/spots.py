@@ -1,17 +1,21 @@
-"""The wing's lights at an instant, to spots in one camera's image: place, size, brightness, halo and reflections.
+"""The lights at an instant, to spots in one camera's image: place, size, brightness, halo and reflections.
 
-A light is a disc that faces the camera (its dome looks round from everywhere). Its image is the disc's affine
-projection; the difference between a disc's centre and its image's centre (perspective; under 0.02 px at the nearest
-pair) is left out, so that ``centre_px`` is exactly the projected centre. Each spot stands where the wing was in the
-exposure of the spot's own row.
+A light is a disc that faces the camera, or a dome whose outline, and with it its image's centre, depends on where it
+is seen from. Its image is the affine projection of the disc, or of the ellipse with the outline's centroid and moments;
+the difference between a disc's centre and its image's centre (perspective; under 0.02 px at the nearest pair) is left
+out, so that a disc's ``centre_px`` is exactly the projected centre. Each spot stands where the light was in the
+exposure of the spot's own row, seen from where the camera was then.
 """
 
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hw_sim import optics
+from hw_sim.mount_motion import PairMotion
 from hw_sim.wing_motion import LedMotion
 from hw_sim.world import CameraTruth, World
 
@@ -49,27 +53,56 @@ def row_times_ns(camera: CameraTruth, start_ns: int, exposure_us: int, rows_px: 
 
 
 def led_spots(world: World, camera: CameraTruth, leds: LedMotion, start_ns: int, exposure_us: int) -> Spots:
-    """Spots of the wing's lights, then of their reflections, in the frame whose row 0 opens at ``start_ns`` (UTC).
+    """Spots in the frame whose row 0 opens at ``start_ns`` (UTC): wing's lights, their reflections, the fuselage's."""
+    pair = PairMotion.of(world, camera.side)
 
-    The wing's place and the row it is seen in depend on each other; iterating from the middle row gains a factor
-    of over 100 a step at the wing's speeds, so that the third is exact to 1e-5 px.
-    """
-    rows = np.full(len(leds), world.sensor.height_px / 2.0)
-    for _ in range(3):
-        rows = optics.project(camera, leds.centres(row_times_ns(camera, start_ns, exposure_us, rows))[0])[:, 1]
-    middle = row_times_ns(camera, start_ns, exposure_us, rows)
-    off_ns = np.rint(_BLUR_NODES * exposure_us * 500.0).astype(np.int64)
-    moved, frames = leds.centres(middle + off_ns[:, None])
+    def wing(times_ns: Times) -> tuple[Array, Array]:
+        centres, frames = leds.centres(times_ns)
+        return pair.as_at_rest(times_ns, centres), pair.axes_as_at_rest(times_ns, frames)
+
+    moved, frames = _exposed(world, camera, wing, len(leds), start_ns, exposure_us)
     centres, frame = moved[1], frames[1]  # the middle node is mid-exposure
     beams, e3 = leds.beams(frame), frame[:, :, 2]
-    direct = facing_spots(world, camera, centres, beams, exposure_us)
-    direct = _with_path(direct, optics.project(camera, moved).transpose(1, 0, 2))
+    dome = world.leds.form == "dome"
+    direct = facing_spots(world, camera, centres, beams, exposure_us, normals=e3 if dome else None)
+    direct = _with_path(direct, optics.project(camera, moved))
     part, spread_m = _FINISHES[world.scene.finish]
     depth = 2.0 * world.leds.height_m * e3
     mirrored_beams = beams - 2.0 * e3 * np.sum(beams * e3, axis=1, keepdims=True)
-    mirror = facing_spots(world, camera, centres - depth, mirrored_beams, exposure_us, part, spread_m)
-    mirror = _with_path(mirror, optics.project(camera, moved - depth).transpose(1, 0, 2))
-    return _visible(_join(direct, mirror), world)
+    mirrored_up = -e3 if dome else None
+    mirror = facing_spots(world, camera, centres - depth, mirrored_beams, exposure_us, part, spread_m, mirrored_up)
+    mirror = _with_path(mirror, optics.project(camera, moved - depth))
+    found = [direct, mirror]
+    fixed = world.fuselage_lights_m(camera.side)
+    if len(fixed):
+
+        def fuselage(times_ns: Times) -> tuple[Array, Array]:
+            return pair.as_at_rest(times_ns, np.broadcast_to(fixed, (*times_ns.shape, 3))), fixed
+
+        moved, _ = _exposed(world, camera, fuselage, len(fixed), start_ns, exposure_us)
+        still = facing_spots(world, camera, moved[1], None, exposure_us)
+        found.append(_with_path(still, optics.project(camera, moved)))
+    return _visible(_join(found), world)
+
+
+def _exposed(
+    world: World,
+    camera: CameraTruth,
+    places: Callable[[Times], tuple[Array, Array]],
+    count: int,
+    start_ns: int,
+    exposure_us: int,
+) -> tuple[Array, Array]:
+    """What ``places`` says at the three instants of each light's own exposure: (3, n, 3), and the rest of it.
+
+    A light's place and the row it is seen in depend on each other; iterating from the middle row gains a factor
+    of over 100 a step at the wing's speeds, so that the third is exact to 1e-5 px.
+    """
+    rows = np.full(count, world.sensor.height_px / 2.0)
+    for _ in range(3):
+        rows = optics.project(camera, places(row_times_ns(camera, start_ns, exposure_us, rows))[0])[:, 1]
+    off_ns = np.rint(_BLUR_NODES * exposure_us * 500.0).astype(np.int64)
+    return places(row_times_ns(camera, start_ns, exposure_us, rows) + off_ns[:, None])
 
 
 def facing_spots(
@@ -80,6 +113,7 @@ def facing_spots(
     exposure_us: int,
     part: float = 1.0,
     spread_m: float = 0.0,
+    normals: Array | None = None,
 ) -> Spots:
     """Spots of lights at rest at ``centres_m`` (n, 3), body frame.
 
@@ -91,15 +125,20 @@ def facing_spots(
         exposure_us: exposure.
         part: of the light that arrives.
         spread_m: one sigma of a diffuse spread at the light's place.
+        normals: (n, 3) of the surface that each stands on as a dome; None: discs that face the camera.
     """
     sight = optics.position_m(camera) - centres_m
     distance_m = np.linalg.norm(sight, axis=1)
     sight = sight / distance_m[:, None]
-    across = np.cross(sight, np.array([0.0, 0.0, 1.0]))
+    across = np.cross(sight, np.array([0.0, 0.0, 1.0]) if normals is None else normals)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     upward = np.cross(across, sight)
     radius_m = world.leds.diameter_m / 2.0
-    steps = np.stack([across, -across, upward, -upward]) * radius_m
+    flat = np.ones(len(centres_m))
+    if normals is not None:
+        flat, lift = _dome(np.abs(np.sum(sight * normals, axis=1)))
+        centres_m = centres_m + (lift * radius_m)[:, None] * upward
+    steps = np.stack([across, -across, flat[:, None] * upward, -flat[:, None] * upward]) * radius_m
     ends = optics.project(camera, centres_m + steps)
     axes: Array = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1) / 2.0
     radius_px = np.sqrt(np.abs(np.linalg.det(axes)))
@@ -116,6 +155,19 @@ def facing_spots(
         sigma_px=np.sqrt(psf**2 + 1.0 / 12.0 + spread_px**2),
         peak_e=part * brightness * facing**world.leds.beam_exponent,
     )
+
+
+def _dome(cosine: Array) -> tuple[Array, Array]:
+    """The outline of half a ball on a flat base, seen at ``cosine`` (n,) of the angle from its axis, as an ellipse.
+
+    Half a disc above the base's centre and half an ellipse, ``cosine`` high, below. By area, centroid and second moment
+    along the axis' image: half height (n,) of the ellipse that has the same centroid and moments, and that centroid's
+    height (n,) above the base's centre; both in radii.
+    """
+    area = np.pi / 2.0 * (1.0 + cosine)
+    lift = 2.0 / 3.0 * (1.0 - cosine**2) / area
+    second = np.pi / 8.0 * (1.0 + cosine**3) / area - lift**2
+    return 2.0 * np.sqrt(second), lift
 
 
 def central_e(spots: Spots) -> Array:
@@ -135,11 +187,13 @@ def _visible(spots: Spots, world: World) -> Spots:
 
 
 def _with_path(spots: Spots, path_px: Array) -> Spots:
-    return Spots(spots.centre_px, path_px, spots.inverse, spots.radius_px, spots.sigma_px, spots.peak_e)
+    """With the path (3, n, 2) of the lights; a dome's image is beside its light, and keeps that distance."""
+    path = path_px.transpose(1, 0, 2) + (spots.centre_px - path_px[1])[:, None]
+    return dataclasses.replace(spots, path_px=path)
 
 
-def _join(first: Spots, second: Spots) -> Spots:
-    return Spots(*(np.concatenate([getattr(first, n), getattr(second, n)]) for n in Spots.__dataclass_fields__))
+def _join(parts: list[Spots]) -> Spots:
+    return Spots(*(np.concatenate([getattr(one, name) for one in parts]) for name in Spots.__dataclass_fields__))
 
 
 def patch_half_px(spots: Spots, world: World) -> NDArray[np.int64]:

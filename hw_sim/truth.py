@@ -2,7 +2,8 @@
 
 ``markers.parquet`` and ``shape.parquet`` have the columns of docs/reference/formats.md that a truth needs, sampled at
 200 Hz from 0.2 s before the first edge to 0.2 s after the last; their ``trigger_index`` is −1. Markers are the lights'
-centres. ``aircraft.parquet`` has the load factor, airspeed, controls and attitude at the same times.
+centres (of a dome, its base's). ``aircraft.parquet`` has the load factor, airspeed, controls and attitude at the same
+times, ``mount.parquet`` how each camera pair has moved against the fuselage, ``fuselage.parquet`` where its lights are.
 """
 
 import csv
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from capture.record import SIDES
 from capture.trigger_protocol import Pulse
 from hw_sim.aircraft import Aircraft
+from hw_sim.mount_motion import PairMotion
 from hw_sim.wing_motion import LedMotion, WingMotion, twist_rad
 from hw_sim.world import World
 
@@ -37,6 +39,8 @@ def write_truth(world: World, from_ns: int, to_ns: int, folder: Path, pulses: li
     _write_table(shape_truth(world, times_ns), world, folder / "shape.parquet")
     aircraft = {"timestamp_ns": times_ns, **Aircraft(world).at(times_ns).columns()}
     _write_table(aircraft, world, folder / "aircraft.parquet")
+    _write_table(mount_truth(world, times_ns), world, folder / "mount.parquet")
+    _write_table(fuselage_truth(world), world, folder / "fuselage.parquet")
     world.write(folder / "world.toml")
     with (folder / "triggers.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -82,6 +86,32 @@ def shape_truth(world: World, times_ns: NDArray[np.int64]) -> dict[str, Any]:
                 "twist_deg": np.degrees(twist_rad(world, state.frames, side)).reshape(-1),
             }
         )
+    return _joined(columns)
+
+
+def mount_truth(world: World, times_ns: NDArray[np.int64]) -> dict[str, Any]:
+    """Columns of ``mount.parquet`` at times (m,): each pair's turn and shift about cam0, body axes."""
+    columns: list[dict[str, Any]] = []
+    for side in SIDES:
+        moved = PairMotion.of(world, side).at(times_ns)
+        columns.append(
+            {
+                "side": np.full(len(times_ns), side),
+                "timestamp_ns": times_ns,
+                **{f"turn_{axis}_mrad": 1e3 * moved[:, at] for at, axis in enumerate("xyz")},
+                **{f"shift_{axis}_mm": 1e3 * moved[:, 3 + at] for at, axis in enumerate("xyz")},
+            }
+        )
+    return _joined(columns)
+
+
+def fuselage_truth(world: World) -> dict[str, Any]:
+    """Columns of ``fuselage.parquet``: a row for each side and reference light."""
+    columns: list[dict[str, Any]] = []
+    for side in SIDES:
+        lights_m = world.fuselage_lights_m(side)
+        names = np.arange(len(lights_m), dtype=np.int32)
+        columns.append({"side": np.full(len(lights_m), side), "light": names, **_coordinates(lights_m)})
     return _joined(columns)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from capture.errors import UsageError
 
-Matrix4 = tuple[tuple[float, ...], ...]
+Matrix = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Leds:
     chord_m: tuple[float, ...] = (0.04, -0.10)  # forward of the axis
     height_m: float = 0.004  # of the light's centre above the axis plane
     diameter_m: float = 0.003
+    form: str = "disc"  # disc: flat, it faces every camera | dome: a bulb, half a ball of this diameter on the wing
     elevation_deg: float = 10.0  # of the beam's axis above the section plane; it points inboard
     beam_exponent: float = 6.0  # radiance falls with cos^n of the angle off the beam's axis
     radiance_e_per_ms: float = 3500.0  # electrons a pixel and millisecond, on the axis of a resolved light, at 0 dB
@@ -85,6 +86,38 @@ class Mount:
 
 
 @dataclass(frozen=True)
+class Fuselage:
+    """Reference lights on rigid brackets of the fuselage, which face the cameras: on in the survey and in flight."""
+
+    lights_m: Matrix = ()  # (x, y, z) each, body frame, for the right pair; mirrored for the left one
+
+
+FUSELAGE_LIGHTS = Fuselage(
+    (  # beside the wing and above it, so that no marker comes near them in either image
+        (-0.26, 0.42, 0.22),
+        (0.30, 0.46, 0.10),
+        (-0.22, 0.62, -0.10),
+        (0.24, 0.66, 0.36),
+        (-0.20, 0.80, 0.40),
+        (0.26, 0.84, -0.12),
+    )
+)
+"""six a side, 0.6 to 1.1 m from the cameras"""
+
+
+@dataclass(frozen=True)
+class MountMotion:
+    """Amplitudes of each pair's motion against the fuselage, see mount_motion; as calibrated and surveyed it stands."""
+
+    drift_mm: float = 0.0
+    drift_mrad: float = 0.0
+    drift_hz: float = 0.03
+    vibration_mm: float = 0.0
+    vibration_mrad: float = 0.0
+    vibration_hz: float = 7.3
+
+
+@dataclass(frozen=True)
 class CameraTruth:
     """One camera as it really is."""
 
@@ -101,7 +134,7 @@ class CameraTruth:
     p1: float
     p2: float
     k3: float
-    T_body_cam: Matrix4
+    T_body_cam: Matrix
     exposure_us: int
     gain_db: float
     row_time_us: float
@@ -198,13 +231,25 @@ class World:
     sensor: Sensor
     scene: Scene
     mount: Mount
+    mount_motion: MountMotion
+    fuselage: Fuselage
     motion: Motion
     board: Board
     survey: Survey
     cameras: tuple[CameraTruth, ...]
 
     @classmethod
-    def make(cls, seed: int = 1, scale: int = 1, background: str = "dark", finish: str = "matt") -> Self:
+    def make(
+        cls,
+        seed: int = 1,
+        scale: int = 1,
+        background: str = "dark",
+        finish: str = "matt",
+        *,
+        form: str = "disc",
+        fuselage: Fuselage | None = None,
+        mount_motion: MountMotion | None = None,
+    ) -> Self:
         """The X-HALE world of ``seed``.
 
         Args:
@@ -212,6 +257,9 @@ class World:
             scale: divides the image's size and focal length; the lights grow with it so that they stay visible.
             background: ``dark`` or ``sunlit``.
             finish: of the wing, ``matt`` or ``clean``.
+            form: of the wing's lights, ``disc`` or ``dome``.
+            fuselage: reference lights; None for none.
+            mount_motion: of the camera pairs; None for none.
 
         Raises:
             UsageError: a value that is not offered.
@@ -219,15 +267,18 @@ class World:
         if scale < 1 or 2080 % scale or 1552 % scale:
             raise UsageError(f"scale {scale}: it must divide the image of 2080 × 1552 (1, 2, 4, 8, 16)")
         sensor = Sensor(width_px=2080 // scale, height_px=1552 // scale, psf_sigma_px=0.9 if scale == 1 else 0.75)
+        diameter_m = 0.004 if form == "dome" else 0.003  # at a low angle half of a dome is seen
         world = cls(
             seed=seed,
             epoch_ns=1_700_000_000_000_000_000,
             trigger_rate_hz=25.0,
             wing=Wing(),
-            leds=Leds(diameter_m=0.003 * (1 + 0.75 * (scale - 1))),
+            leds=Leds(diameter_m=diameter_m * (1 + 0.75 * (scale - 1)), form=form),
             sensor=sensor,
             scene=Scene(background=background, finish=finish),
             mount=Mount(),
+            mount_motion=mount_motion or MountMotion(),
+            fuselage=fuselage or Fuselage(),
             motion=Motion(),
             board=Board(),
             survey=Survey(),
@@ -267,11 +318,21 @@ class World:
                 return camera
         raise KeyError(f"{side}_{name}")
 
+    def fuselage_lights_m(self, side: str) -> NDArray[np.float64]:
+        """(n, 3) places of a side's reference lights, body frame."""
+        out = 1.0 if side == "right" else -1.0
+        right: NDArray[np.float64] = np.array(self.fuselage.lights_m, dtype=np.float64).reshape(-1, 3)
+        return np.asarray(right * np.array([1.0, out, 1.0]))
+
     def _checked(self, where: str) -> Self:
         if self.scene.background not in ("dark", "sunlit"):
             raise UsageError(f"{where}: background {self.scene.background!r} is unknown: use dark or sunlit")
         if self.scene.finish not in ("matt", "clean"):
             raise UsageError(f"{where}: finish {self.scene.finish!r} is unknown: use matt or clean")
+        if self.leds.form not in ("disc", "dome"):
+            raise UsageError(f"{where}: form {self.leds.form!r} of the lights is unknown: use disc or dome")
+        if any(len(place) != 3 for place in self.fuselage.lights_m):
+            raise UsageError(f"{where}: fuselage.lights_m: each light has x, y and z, in metres")
         for sine in self.motion.sines:
             if sine.shape not in ("bending1", "bending2", "twist", "inplane"):
                 raise UsageError(f"{where}: shape {sine.shape!r} is unknown: use bending1, bending2, twist or inplane")
