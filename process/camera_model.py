@@ -267,6 +267,8 @@ class ReferenceLight:
     """surveyed, body frame"""
     sigma_m: float
     """of each coordinate"""
+    survey_px: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """where cam0 and cam1 saw it in the survey's pictures: motion since is counted from there; None if not known"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,7 +320,9 @@ class RigSide:
             value["pose_covariance"],
             value.get("pose_by_calibration"),
             tuple(
-                ReferenceLight(str(light["name"]), tuple(light["xyz_m"]), float(light["sigma_m"]))
+                ReferenceLight(
+                    str(light["name"]), tuple(light["xyz_m"]), float(light["sigma_m"]), _pixels(light.get("survey_px"))
+                )
                 for light in value.get("references", [])
             ),
         )
@@ -422,6 +426,13 @@ def _solve_2x2(matrix: Array, right: Array) -> Array:
     a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
     solution = np.stack([d * right[:, 0] - b * right[:, 1], a * right[:, 1] - c * right[:, 0]], axis=1)
     return np.asarray(solution / (a * d - b * c)[:, None])
+
+
+def _pixels(value: list[list[float]] | None) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    if value is None:
+        return None
+    (u0, v0), (u1, v1) = value
+    return (float(u0), float(v0)), (float(u1), float(v1))
 
 
 def _freeze(owner: object, name: str, value: ArrayLike, shape: tuple[int, ...]) -> None:

@@ -16,10 +16,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from process.camera_model import Rig, RigSide
-from process.detect import detect
-from process.fuselage_lights import lights_px
+from process.fuselage_lights import lights_seen
 from process.pose_fit import moved_pose, project
-from process.recording import FrameSetReader, Recording, SetPlaces
 from process.shared_error import shared_jacobian
 from process.triangulate import epipolar_distance_px
 
@@ -27,7 +25,6 @@ Array = NDArray[np.float64]
 
 BLOCK_S, MOST_BLOCKS = 10.0, 300
 SETS_A_BLOCK = 50  # of the markers' that are looked at
-LIGHT_SETS_A_BLOCK = 3
 FLOOR_PX = 0.01  # of a mean: what lens and spot models leave
 TURN_PRIOR_RAD = 1e-3  # of a camera against the other: what a mount may do
 MOVED_PRIOR = np.array([5e-3] * 3 + [5e-3] * 3)  # of the pair against the fuselage, rad and m
@@ -64,10 +61,9 @@ class _Block:
     markers: dict[int, Array]  # mean (5,) of u0, v0, u1, v1 and the epipolar residual
 
 
-def drift(markers: pa.Table, recording: Recording | None, rig: Rig) -> pa.Table:
-    """A row (``DRIFT_SCHEMA``) for each side and block of time of a marker table.
+def drift(markers: pa.Table, lights: pa.Table, rig: Rig) -> pa.Table:
+    """A row (``DRIFT_SCHEMA``) for each side and block of time of a marker table and its table of fuselage lights.
 
-    ``recording``, whose frames are read again at a few instants a block, is needed for the lights on the fuselage only.
     NaN where fewer than four markers, or lights, were seen both then and at first.
     """
     rows: list[dict[str, Any]] = []
@@ -77,12 +73,10 @@ def drift(markers: pa.Table, recording: Recording | None, rig: Rig) -> pa.Table:
             continue
         side = rig.side(name)
         blocks = [_block(columns, begin, end) for begin, end in edges]
-        lights = [np.full((len(side.references), 2, 2), np.nan)] * len(edges)
-        if recording is not None and side.references:
-            lights = list(_lights(recording.sides.get(name, ()), columns, edges, side))
+        found = list(_lights(lights, name, side, columns, edges))
         first = next((block for block in blocks if len(block.markers) >= FEWEST), blocks[0])
-        first_lights = next((seen for seen in lights if np.isfinite(seen).all(axis=(1, 2)).sum() >= FEWEST), lights[0])
-        for block, seen in zip(blocks, lights, strict=True):
+        first_lights = next((seen for seen in found if np.isfinite(seen).all(axis=(1, 2)).sum() >= FEWEST), found[0])
+        for block, seen in zip(blocks, found, strict=True):
             row: dict[str, Any] = {"side": name, "time_s": block.time_s}
             row |= _by_epipolar(side, first, block)
             rows.append(row | _by_lights(side, first_lights, seen, block.tip_m))
@@ -231,22 +225,12 @@ def _at_tip(side: RigSide, tip_m: Array, motion: Array, covariance: Array) -> tu
 
 
 def _lights(
-    sets: Sequence[SetPlaces],
-    columns: dict[str, NDArray[Any]],
-    edges: Sequence[tuple[float, float]],
-    side: RigSide,
+    lights: pa.Table, name: str, side: RigSide, columns: dict[str, NDArray[Any]], edges: Sequence[tuple[float, float]]
 ) -> Iterator[Array]:
-    """(L, 2, 2) means of the lights' pixels over a few sets of each block."""
-    by_trigger = {places.trigger_index: places for places in sets}
-    with FrameSetReader() as reader:
-        for begin, end in edges:
-            triggers = np.unique(columns["trigger_index"][_during(columns, begin, end)])
-            some = np.linspace(0, len(triggers) - 1, min(LIGHT_SETS_A_BLOCK, len(triggers))).astype(int)
-            seen = [np.full((len(side.references), 2, 2), np.nan)]
-            for trigger in triggers[some]:
-                first, second = reader.read(by_trigger[int(trigger)]).images
-                if first is not None and second is not None:
-                    seen.append(lights_px(side, (detect(first), detect(second))))
-            stacked = np.array(seen)
-            count = np.isfinite(stacked).sum(axis=0)
-            yield np.where(count > 0, np.nansum(stacked, axis=0) / np.maximum(count, 1), np.nan)
+    """(L, 2, 2) means of the lights' pixels in each block."""
+    triggers, spots = lights_seen(lights, name, side)
+    for begin, end in edges:
+        own = np.isin(triggers, columns["trigger_index"][_during(columns, begin, end)])
+        seen = spots.pixels[own]
+        count = np.isfinite(seen).sum(axis=0)
+        yield np.where(count > 0, np.nansum(seen, axis=0) / np.maximum(count, 1), np.nan)

@@ -1,34 +1,103 @@
-"""Spots of a frame set to the lights on the fuselage among them: where they are, and the others without them."""
+"""Spots of a frame set to the lights on the fuselage among them, and those to a table; and the others without them."""
 
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from process.camera_model import RigSide
 from process.detect import Detections
 from process.pose_fit import project
+from process.tables import PIXEL_COVARIANCES
 
 Array = NDArray[np.float64]
 
 REACH_PX = 15.0
 """a spot this close to where a light should be is the light: survey, calibration and what the mount may have moved"""
 
+LIGHTS_SCHEMA: pa.Schema = pa.schema(
+    [
+        ("trigger_index", pa.int64()),
+        ("side", pa.string()),
+        ("light", pa.string()),
+        *((name, pa.float64()) for name in ("u0_px", "v0_px", "u1_px", "v1_px")),
+        *((name, pa.float64()) for name in PIXEL_COVARIANCES),
+    ]
+)
+"""columns of ``…_lights.parquet`` (docs/reference/formats.md)"""
 
-def lights_px(side: RigSide, spots: tuple[Detections, Detections]) -> Array:
-    """(L, 2, 2) centres, by light and camera, of the rig's references; NaN where there is no spot in reach."""
-    found = np.full((len(side.references), 2, 2), np.nan)
-    for camera, (numbers, own) in enumerate(zip(_numbers(side, spots), spots, strict=True)):
-        found[numbers >= 0, camera] = own.pixels[numbers[numbers >= 0]]
-    return found
+
+def lights_path(markers: Path) -> Path:
+    """Where a marker table's fuselage lights are kept: ``markers.parquet`` → ``markers_lights.parquet``."""
+    return markers.with_name(f"{markers.stem}_lights.parquet")
 
 
-def without_lights(side: RigSide, spots: tuple[Detections, Detections]) -> tuple[Detections, Detections]:
-    """The spots without those of the rig's references, which are no markers."""
+@dataclass(frozen=True, eq=False)
+class LightSpots:
+    """Spots of a side's L lights, by both cameras; NaN where there was none."""
+
+    pixels: Array
+    """(L, 2, 2) of light, camera, (u, v)"""
+    covariance_px2: Array
+    """(L, 2, 2, 2)"""
+
+
+def light_spots(
+    side: RigSide, spots: tuple[Detections, Detections]
+) -> tuple[LightSpots, tuple[Detections, Detections]]:
+    """The spots of the rig's reference lights, and the others: those of the markers."""
+    lights = LightSpots(np.full((len(side.references), 2, 2), np.nan), np.full((len(side.references), 2, 2, 2), np.nan))
     if not side.references:
-        return spots
-    first, second = (_without(own, numbers) for own, numbers in zip(spots, _numbers(side, spots), strict=True))
-    return first, second
+        return lights, spots
+    numbers = _numbers(side, spots)
+    for camera, (chosen, own) in enumerate(zip(numbers, spots, strict=True)):
+        lights.pixels[chosen >= 0, camera] = own.pixels[chosen[chosen >= 0]]
+        lights.covariance_px2[chosen >= 0, camera] = own.covariance_px2[chosen[chosen >= 0]]
+    first, second = (_without(own, chosen) for own, chosen in zip(spots, numbers, strict=True))
+    return lights, (first, second)
+
+
+def lights_table(name: str, side: RigSide, seen: Iterable[tuple[int, LightSpots]]) -> pa.Table:
+    """A row for each set, given as its trigger index and spots, and light of the side called ``name``."""
+    sets = list(seen)
+    if not sets:
+        return LIGHTS_SCHEMA.empty_table()
+    pixels = np.concatenate([spots.pixels for _, spots in sets])
+    spread = np.concatenate([spots.covariance_px2 for _, spots in sets])
+    columns = {
+        "trigger_index": np.repeat([trigger for trigger, _ in sets], len(side.references)),
+        "side": np.full(len(pixels), name, dtype=object),
+        "light": np.tile(np.array([light.name for light in side.references], dtype=object), len(sets)),
+    }
+    for camera in (0, 1):
+        for at, axis in enumerate("uv"):
+            columns[f"{axis}{camera}_px"] = pixels[:, camera, at]
+        for at, axes in enumerate(((0, 0), (0, 1), (1, 1))):
+            columns[PIXEL_COVARIANCES[3 * camera + at]] = spread[:, camera, *axes]
+    return pa.table([pa.array(columns[one.name], one.type) for one in LIGHTS_SCHEMA], schema=LIGHTS_SCHEMA)
+
+
+def lights_seen(table: pa.Table, name: str, side: RigSide) -> tuple[NDArray[np.int64], LightSpots]:
+    """A lights table's sets of the side called ``name``: triggers (F,), growing, and spots with (F, L, …) in front.
+
+    Lights that the rig does not know are left out.
+    """
+    number = {light.name: at for at, light in enumerate(side.references)}
+    light = np.array([number.get(one, -1) for one in table.column("light").to_pylist()], dtype=np.intp)
+    rows = np.flatnonzero((np.array(table.column("side").to_pylist(), dtype=object) == name) & (light >= 0))
+    triggers, at = np.unique(table.column("trigger_index").to_numpy()[rows], return_inverse=True)
+    shape = (len(triggers), len(side.references), 2)
+    pixels, spread = np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan)
+    for camera in (0, 1):
+        for axis, letter in enumerate("uv"):
+            pixels[at, light[rows], camera, axis] = table.column(f"{letter}{camera}_px").to_numpy()[rows]
+        for column, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
+            values = table.column(PIXEL_COVARIANCES[3 * camera + column]).to_numpy()[rows]
+            spread[at, light[rows], camera, i, j] = spread[at, light[rows], camera, j, i] = values
+    return triggers, LightSpots(pixels, spread)
 
 
 def _numbers(side: RigSide, spots: tuple[Detections, Detections]) -> list[NDArray[np.intp]]:

@@ -20,10 +20,10 @@ from capture.errors import ProcessError, UsageError
 from process.camera_model import Rig
 from process.detect import DetectSettings
 from process.drift import drift, drift_path, worst
+from process.fuselage_lights import lights_path
 from process.match import MatchSettings
 from process.pipeline import MarkersResult, PipelineSettings
 from process.pipeline import markers as run_pipeline
-from process.recording import open_recording
 from process.shared_error import with_rig
 from process.signal_options import DbcOption, MaxGapOption
 from process.signal_table import MAX_GAP_S, sets_of, signal_table, signals_path
@@ -96,8 +96,9 @@ def markers(
     write_table(with_rig(result.table, cameras), output, command=command, inputs=[rig])
     beside = signal_table(sets_of(result.table), signals, max_gap)
     write_table(beside, signals_path(output), command=command, inputs=dbc or ())
-    recording = open_recording(flight) if cameras.left.references or cameras.right.references else None
-    moved = drift(result.table, recording, cameras)
+    if result.lights.num_rows:
+        write_table(result.lights, lights_path(output), command=command, inputs=[rig])
+    moved = drift(result.table, result.lights, cameras)
     write_table(moved, drift_path(output), command=command, inputs=[rig])
     summary = summarise(result) | {"drift": worst(moved), "signals": [signal.name for signal in signals.signals]}
     problems = tuple(dict.fromkeys((*result.problems, *signals.problems)))  # both have read the aux files

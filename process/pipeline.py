@@ -23,7 +23,7 @@ from process.bulb import centres_m, wing_normals
 from process.camera_model import MarkerLayout, Rig, RigSide
 from process.detect import Detections, DetectSettings, detect_all
 from process.flight_cameras import check_cameras
-from process.fuselage_lights import without_lights
+from process.fuselage_lights import LIGHTS_SCHEMA, LightSpots, light_spots, lights_table
 from process.lone_spots import lone_spots
 from process.match import UNSEEN, Matches, MatchSettings, Sighting, Track, match_sighting, sightings
 from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
@@ -59,6 +59,8 @@ class MarkersResult:
     problems: tuple[str, ...]
     rejected: dict[str, int]
     """blobs turned down in detection, by reason"""
+    lights: pa.Table = field(default_factory=LIGHTS_SCHEMA.empty_table)
+    """spots of the lights on the fuselage (``LIGHTS_SCHEMA``)"""
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,7 @@ class BlockResult:
     frame_sets: int
     problems: tuple[str, ...]
     rejected: dict[str, int]
+    lights: pa.Table
 
 
 @dataclass
@@ -100,6 +103,7 @@ class _Rows:
     columns: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in MARKER_SCHEMA.names})
     problems: list[str] = field(default_factory=list)
     rejected: Counter[str] = field(default_factory=Counter)
+    lights: list[tuple[int, LightSpots]] = field(default_factory=list)
 
 
 def markers(
@@ -154,7 +158,8 @@ def markers_of_recording(
         rejected.update(result.rejected)
     problems = (*recording.problems, *(problem for result in results for problem in result.problems))
     table = pa.concat_tables([result.table for result in results])
-    return MarkersResult(table, done, time.monotonic() - began, problems, dict(rejected))
+    lights = pa.concat_tables([result.lights for result in results])
+    return MarkersResult(table, done, time.monotonic() - began, problems, dict(rejected), lights)
 
 
 def blocks(recording: Recording) -> list[Block]:
@@ -176,7 +181,8 @@ def measure_block(job: BlockJob) -> BlockResult:
         # without any frame there is no time either: it is in the problems
         timed = [frames for frames in some if any(moment is not None for moment in frames.mid_exposures_ns)]
         track = _process_sets(into, timed, rig, settings, track)
-    return BlockResult(_table(into), len(job.block.places), tuple(into.problems), dict(into.rejected))
+    lights = lights_table(job.block.side, rig.side(job.block.side), into.lights)
+    return BlockResult(_table(into), len(job.block.places), tuple(into.problems), dict(into.rejected), lights)
 
 
 def _loaded(places: Sequence[SetPlaces]) -> Iterator[list[FrameSet]]:
@@ -215,7 +221,7 @@ def _process_sets(
     spots = detect_all(images, settings.detection)
     for found in spots:
         into.rejected.update(rejected.reason.split(":")[0] for rejected in found.rejected)
-    seen = _sightings(whole, spots, rig, settings)
+    seen = _sightings(into, whole, spots, rig, settings)
     for frames in sets:
         side = rig.side(frames.side)
         sighting = seen.get(frames.trigger_index)
@@ -232,14 +238,19 @@ def _process_sets(
 
 
 def _sightings(
-    whole: Sequence[FrameSet], spots: Sequence[Detections], rig: Rig, settings: PipelineSettings
+    into: _Rows, whole: Sequence[FrameSet], spots: Sequence[Detections], rig: Rig, settings: PipelineSettings
 ) -> dict[int, Sighting]:
-    """By trigger index, of sets with both frames, of which ``spots`` were found in turn."""
+    """By trigger index, of sets with both frames, of which ``spots`` were found in turn; takes note of the fuselage."""
     if not whole:
         return {}
     name = whole[0].side
     side = rig.side(name)
-    pairs = [without_lights(side, pair) for pair in zip(spots[0::2], spots[1::2], strict=True)]
+    pairs = []
+    for frames, pair in zip(whole, zip(spots[0::2], spots[1::2], strict=True), strict=True):
+        lights, others = light_spots(side, pair)
+        pairs.append(others)
+        if side.references:
+            into.lights.append((frames.trigger_index, lights))
     found = sightings(name, side, rig.markers, pairs, settings.matching)
     return {frames.trigger_index: one for frames, one in zip(whole, found, strict=True)}
 

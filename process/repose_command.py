@@ -53,7 +53,7 @@ def repose(
             T_body_cam0=fit.T_body_cam0,
             pose_covariance=fit.covariance,
             pose_by_calibration=fit.by_calibration,
-            references=references_of(side),
+            references=references_of(side, fit),
         )
         summary[name] = {**summarise(fit), "moved": _moved(name, old.markers, known, sides[name])}
         for warning in fit.warnings:

@@ -42,6 +42,8 @@ class PointFit:
     """(3,) triangulated minus surveyed place; NaN if not seen by both cameras"""
     residuals_px: Array
     """(2, 2) measured minus projected, in cam0 and cam1, of the adjusted place; NaN if not used"""
+    pixels: Array
+    """(2, 2) measured; NaN if not used"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +120,10 @@ def solve_pose(
         index = int(np.flatnonzero(used)[worst])
         used[index] = False
         reasons[index] = f"does not fit the others (chi2 {chi2[worst]:.0f} of 4): check its coordinates"
-    return _fit(names, surveyed_m, T, covariance, by_calibration, chi2, residuals, used, reasons, in_cam0, lens)
+    seen_px = measured(assigned[used], spots0, spots1)[0]
+    return _fit(
+        names, surveyed_m, T, covariance, by_calibration, chi2, (residuals, seen_px), used, reasons, in_cam0, lens
+    )
 
 
 def _refuse_touched(lens: LensCheck | None) -> None:
@@ -137,7 +142,7 @@ def _fit(
     covariance: Array,
     by_calibration: Array,
     chi2: Array,
-    residuals: Array,
+    in_images: tuple[Array, Array],
     used: NDArray[np.bool_],
     reasons: list[str],
     in_cam0: Array,
@@ -161,11 +166,11 @@ def _fit(
     warnings = []
     if ratio > WARNED_MISFIT**2:
         warnings.append(f"{misfit}: the survey or the calibration is worse than stated")
-    pixels = np.full((len(names), 2, 2), np.nan)
-    pixels[used] = residuals
+    pixels = np.full((2, len(names), 2, 2), np.nan)
+    pixels[:, used] = in_images
     points = [
-        PointFit(name, bool(use), "" if use else reason, error, pixel)
-        for name, use, reason, error, pixel in zip(names, used, reasons, errors, pixels, strict=True)
+        PointFit(name, bool(use), "" if use else reason, error, residual, seen)
+        for name, use, reason, error, residual, seen in zip(names, used, reasons, errors, *pixels, strict=True)
     ]
     return PoseFit(T, covariance * max(1.0, ratio), by_calibration, points, ratio, lens, warnings)
 

@@ -92,7 +92,7 @@ def build_rig(pairs: dict[str, StereoPair], survey: Survey, fits: dict[str, Pose
             1000.0 * survey.row_time_us,
             fits[name].covariance,
             fits[name].by_calibration,
-            references_of(getattr(survey, name)),
+            references_of(getattr(survey, name), fits[name]),
         )
         for name in ("left", "right")
     }
@@ -103,11 +103,15 @@ def build_rig(pairs: dict[str, StereoPair], survey: Survey, fits: dict[str, Pose
     return Rig(sides["left"], sides["right"], layout, made)
 
 
-def references_of(side: SurveySide) -> tuple[ReferenceLight, ...]:
-    """The surveyed lights that are seen in flight, too."""
-    return tuple(
-        ReferenceLight(point.name, point.xyz_m, point.sigma_mm / 1000.0) for point in side.points if point.on_fuselage
-    )
+def references_of(side: SurveySide, fit: PoseFit) -> tuple[ReferenceLight, ...]:
+    """The surveyed lights that are seen in flight, too, and where ``fit``'s pictures have them."""
+    lights = []
+    for point, found in zip(side.points, fit.points, strict=True):
+        if point.on_fuselage:
+            (u0, v0), (u1, v1) = found.pixels.tolist()
+            seen = ((u0, v0), (u1, v1)) if found.used else None
+            lights.append(ReferenceLight(point.name, point.xyz_m, point.sigma_mm / 1000.0, seen))
+    return tuple(lights)
 
 
 def _images(side: SurveySide) -> tuple[Path, Path]:

@@ -8,12 +8,12 @@ import pytest
 
 from process.camera_model import ReferenceLight, Rig, pose_matrix
 from process.drift import drift, worst
-from process.fuselage_lights import lights_px, without_lights
+from process.fuselage_lights import LIGHTS_SCHEMA, light_spots, lights_seen
 from process.pipeline import markers
-from process.recording import open_recording
 from process.tables import MARKER_SCHEMA
 from process.triangulate import triangulate
 
+NO_LIGHTS = LIGHTS_SCHEMA.empty_table()
 START_NS = 1_700_000_000_000_000_000
 LIGHTS_M = [
     [-0.2, 0.6, 0.15],
@@ -81,7 +81,7 @@ def true_cost_m(world, side):
 
 def test_the_epipolar_residual_shows_a_camera_that_turns(world):
     turns = [(0.0, 0.0, 0.0), (3e-4, 0.0, 0.0), (6e-4, 0.0, -4e-4)]
-    found = drift(flight_table(world, turns), None, world.rig)
+    found = drift(flight_table(world, turns), NO_LIGHTS, world.rig)
     assert found.column("side").to_pylist() == ["right"] * 3
     cost = found.column("epipolar_tip_mm").to_numpy()
     sigma = found.column("epipolar_tip_sigma_mm").to_numpy()
@@ -92,7 +92,7 @@ def test_the_epipolar_residual_shows_a_camera_that_turns(world):
     assert abs(found.column("epipolar_px").to_numpy()[1]) == pytest.approx(3e-4 * 1404 / 2**0.5, rel=0.15)
     # a turn about the vertical hardly shows, and the sigma says so
     assert sigma.min() > 1.0
-    steady = worst(drift(flight_table(world, turns[:1] * 3), None, world.rig))["right"]
+    steady = worst(drift(flight_table(world, turns[:1] * 3), NO_LIGHTS, world.rig))["right"]
     assert abs(steady["epipolar_px"]) < 0.02
     assert steady["epipolar_tip_mm"] < 3 * steady["epipolar_tip_sigma_mm"]
 
@@ -120,9 +120,19 @@ def test_lights_on_the_fuselage_show_the_rest(tmp_path, small_world, painter, re
                 canvas.add(u, v, 0.6, 0.7, 140)
             writer.frame("right", f"cam{camera}", trigger, canvas.image(), START_NS + trigger * 2_500_000_000)
     writer.close()
-    table = markers([tmp_path], rig, workers=1).table
+    measured_flight = markers([tmp_path], rig, workers=1)
+    table = measured_flight.table
     assert np.isfinite(table.column("x_m").to_numpy()).reshape(8, 18)[:, :12].all()
-    found = drift(table, open_recording([tmp_path]), rig).to_pylist()
+    triggers, spots = lights_seen(measured_flight.lights, "right", rig.right)
+    assert triggers.tolist() == list(range(8))
+    assert (
+        np.abs(
+            spots.pixels[0] - np.stack(seen_by(small_world, small_world.rig.right, np.array(LIGHTS_M)), axis=1)
+        ).max()
+        < 0.1
+    )
+    assert 0.0 < spots.covariance_px2[:, :, :, 0, 0].max() < 0.05**2
+    found = drift(table, measured_flight.lights, rig).to_pylist()
     assert [row["lights"] for row in found] == [6, 6]
     assert found[0]["lights_px"] == 0.0
     truth_mm = 1000 * true_cost_m(small_world, now)
@@ -137,21 +147,22 @@ def test_fuselage_lights_are_no_markers(world, painter):
     from process.detect import detect
 
     pixels = seen_by(world, world.rig.right, np.array(LIGHTS_M))
-    others = [[300.0, 300.0], [1500.0, 1200.0]]
+    marker_like = [[300.0, 300.0], [1500.0, 1200.0]]
     spots = []
     for camera in (0, 1):
         canvas = painter(1552, 2080, seed=camera)
-        for u, v in [*pixels[camera][:5], *others]:
+        for u, v in [*pixels[camera][:5], *marker_like]:
             canvas.add(u, v, 1.0, 0.8, 140)
         spots.append(detect(canvas.image()))
-    found = lights_px(rig.right, tuple(spots))
+    lights, others = light_spots(rig.right, tuple(spots))
+    found = lights.pixels
     np.testing.assert_allclose(found[:5], np.stack(pixels, axis=1)[:5], atol=0.06)
     assert np.isnan(found[5]).all()
-    for left in without_lights(rig.right, tuple(spots)):
+    for left in others:
         assert sorted(left.u_px.round()) == [300.0, 1500.0]
         assert len(left.flags) == 2
-    assert without_lights(world.rig.right, tuple(spots))[0] is spots[0]
+    assert light_spots(world.rig.right, tuple(spots))[1][0] is spots[0]
 
 
 def test_a_flight_without_markers_has_no_drift(world):
-    assert drift(flight_table(world, [(0.0, 0.0, 0.0)]).slice(0, 0), None, world.rig).num_rows == 0
+    assert drift(flight_table(world, [(0.0, 0.0, 0.0)]).slice(0, 0), NO_LIGHTS, world.rig).num_rows == 0
