@@ -1,17 +1,12 @@
 """A recording's provenance to which camera stood where, held against the rig: swapped cameras are not measured with."""
 
 import json
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 
-from mcap.exceptions import McapError
-from mcap.records import Chunk, Metadata
-from mcap.stream_reader import StreamReader
-
 from capture.errors import ProcessError
-from capture.record import PROVENANCE
 from process.camera_model import Rig
+from process.provenance import recorded_provenance
 
 
 def recorded_serials(files: Sequence[Path]) -> dict[str, str]:
@@ -51,15 +46,8 @@ def check_cameras(files: Sequence[Path], rig: Rig) -> None:
 
 
 def _serials_of(path: Path) -> dict[str, str]:
-    """Of one file: its provenance stands before its first chunk."""
     try:
-        with path.open("rb") as stream:
-            for record in StreamReader(stream, emit_chunks=True).records:
-                if isinstance(record, Metadata) and record.name == PROVENANCE:
-                    value = json.loads(record.metadata.get("serials", "{}"))
-                    return {str(place): str(serial) for place, serial in value.items()}
-                if isinstance(record, Chunk):
-                    break
-    except (McapError, struct.error, ValueError, AttributeError, OverflowError, MemoryError, EOFError, OSError):
-        pass  # what is wrong with a file, reading its frames will tell
-    return {}
+        value = json.loads(recorded_provenance(path).get("serials", "{}"))
+        return {str(place): str(serial) for place, serial in value.items()}
+    except (ValueError, AttributeError):
+        return {}

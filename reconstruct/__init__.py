@@ -46,12 +46,17 @@ def reconstruct(
     Raises:
         WingshapeError: as ``capture.errors`` says; the message says what to do.
     """
+    from capture.errors import UsageError
+    from process.flights import find_flights
     from process.reference import parse_window
     from reconstruct.dense import ResultFolder
     from reconstruct.run import Job, run_job
 
     paths = [Path(path) for path in ([flight] if isinstance(flight, (str, Path)) else flight)]
     table = paths[0] if len(paths) == 1 and paths[0].suffix == ".parquet" else None
+    names = [] if table else [one.name for one in find_flights(paths)]
+    if len(names) > 1:
+        raise UsageError(f"these are different flights ({', '.join(names)}): reconstruct one at a time")
     job = Job(
         flights=() if table else tuple(paths),
         rig=None if rig is None else Path(rig),

@@ -3,7 +3,7 @@
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,15 +16,19 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from capture.console import note, run, say, say_json
-from capture.errors import UsageError
+from capture.errors import ReconstructError, UsageError
+from process.flights import Flight, find_flights
 from process.reference import parse_window
 from process.signal_options import DbcOption, MaxGapOption
 from process.signal_table import MAX_GAP_S
-from reconstruct.air_table import NAMES, parse_specific_force
+from reconstruct import options
+from reconstruct.air_table import parse_specific_force
+from reconstruct.batch import FLIGHTS, outcome_lines, run_flights
 from reconstruct.import_wing import import_wing
 from reconstruct.plan import plan
+from reconstruct.reference import Reference
 from reconstruct.report import write_report
-from reconstruct.result import COMPARISON, REPORT, SUMMARY, read_result
+from reconstruct.result import COMPARISON, REPORT, SUMMARY, read_json_object, read_result
 from reconstruct.run import Job, Progress, Step, run_comparison, run_job
 from reconstruct.static import static
 from reconstruct.summary import verdict
@@ -53,71 +57,72 @@ app = typer.Typer(
 
 @app.command("run")
 def run_command(
-    wing: Annotated[Path, typer.Option(help="wing.toml: structure, markers, and what the fit may assume.")],
-    out: Annotated[Path, typer.Option("--output", "-o", help="Folder for the result; made when it is not there.")],
-    flight: Annotated[
-        list[Path] | None, typer.Argument(help="The flight's folders, or its marker table (a .parquet file).")
-    ] = None,
-    rig: Annotated[Path | None, typer.Option(help="rig.json of this flight's cameras; needed for frames.")] = None,
-    markers: Annotated[Path | None, typer.Option(help="Start from this marker table instead of frames.")] = None,
-    smooth: Annotated[
-        float,
-        typer.Option(min=0.0, help="Smooth in time, and bridge gaps: seconds over which motion is alike; 0: off."),
-    ] = 0.0,
-    reference: Annotated[
-        Path | None,
-        typer.Option(
-            help="Count displacements from this, not the unloaded wing: of `wingproc reference`, or a result."
-        ),
-    ] = None,
-    reference_window: Annotated[
-        str | None, typer.Option(help="Count displacements from the mean of these seconds of this recording, A:B.")
-    ] = None,
-    direct: Annotated[
-        bool, typer.Option("--direct", help="Fit both cameras' pixels: a light that one camera saw counts too.")
-    ] = False,
+    wing: options.Wing,
+    out: options.Out,
+    flight: options.Flights = None,
+    rig: options.Rig = None,
+    markers: options.Markers = None,
+    smooth: options.Smooth = 0.0,
+    reference: options.ReferenceFile = None,
+    reference_window: options.ReferenceWindow = None,
+    direct: options.Direct = False,
     dbc: DbcOption = None,
     max_gap: MaxGapOption = MAX_GAP_S,
-    specific_force: Annotated[
-        str | None,
-        typer.Option(help=f"Aerodynamic loads too, by these signals of the aircraft's acceleration: {NAMES}."),
-    ] = None,
-    csv: Annotated[bool, typer.Option(help="Write the tables as CSV too.")] = True,
-    mat: Annotated[bool, typer.Option(help="Write result.mat for MATLAB.")] = True,
-    mcap: Annotated[bool, typer.Option(help="Write wing.mcap, the wing in 3-D for Foxglove.")] = True,
-    netcdf: Annotated[bool, typer.Option(help="Write result.nc (NetCDF; needs xarray).")] = False,
-    report: Annotated[bool, typer.Option(help="Draw the report; `reconstruct report` can do so later.")] = True,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(help="Address of a Dask scheduler whose workers are to work, or local: a cluster here."),
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    specific_force: options.Force = None,
+    csv: options.Csv = True,
+    mat: options.Mat = True,
+    mcap: options.Mcap = True,
+    netcdf: options.Netcdf = False,
+    report: options.Report = True,
+    workers: options.Workers = None,
+    scheduler: options.Scheduler = None,
+    json: options.Json = False,
 ) -> None:
-    """Reconstruct a flight: markers (from frames, or a table), shapes, loads, summary and report."""
+    """Reconstruct a flight: markers (from frames, or a table), shapes, loads, summary and report.
+
+    Of several flights, each gets a folder of its name in the output folder, beside flights.json, which says what
+    became of each; one that fails does not stop the others. Run again, the command keeps what it had got done.
+    """
     flights, table = _sources(list(flight or []), markers)
     _check_files({"--rig": rig, "--wing": wing, "--markers": table})
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: is a file; give a folder for the result")
-    if reference is not None and reference_window is not None:
-        raise UsageError("give --reference or --reference-window, not both")
-    at_rest = parse_window(reference_window, "--reference-window") if reference_window is not None else reference
     if dbc and table is not None:
         raise UsageError(
             "--dbc is for a flight: a marker table has its signals beside it, from `wingproc markers --dbc`"
         )
-    also = tuple(name for name, wanted in (("mat", mat), ("mcap", mcap), ("netcdf", netcdf)) if wanted)
     job = Job(
-        *(tuple(flights), rig, table, wing, out, csv, workers, _command(), smooth, at_rest, also, report, scheduler),
+        flights=tuple(flights),
+        rig=rig,
+        markers=table,
+        wing=wing,
+        out=out,
+        csv=csv,
+        workers=workers,
+        command=_command(),
+        smooth_s=smooth,
+        reference=_reference(reference, reference_window),
+        also=tuple(name for name, wanted in (("mat", mat), ("mcap", mcap), ("netcdf", netcdf)) if wanted),
+        report=report,
+        scheduler=scheduler,
         dbc=tuple(dbc or ()),
         max_gap_s=max_gap,
         direct=direct,
         specific_force=None if specific_force is None else parse_specific_force(specific_force),
     )
+    several = find_flights(flights)
+    if len(several) > 1:
+        _run_several(job, several, json=json)
+    else:
+        _run_one(job, json=json)
+
+
+def _run_one(job: Job, *, json: bool) -> None:
     with _progress() as progress:
         summary, warnings = run_job(job, progress)
+    page = job.out / REPORT
     if json:
-        say_json({**summary, "warnings": list(warnings), "report": str(out / REPORT) if report else None})
+        say_json({**summary, "warnings": list(warnings), "report": str(page) if job.report else None})
         return
     for warning in warnings[:SHOWN_WARNINGS]:
         note(f"warning: {warning}")
@@ -130,8 +135,30 @@ def run_command(
     say(f"verdict         {' '.join(verdict(summary))}")
     say(f"time            {summary['wall_s']:.1f} s{_speed(summary)}, {summary['peak_mb']:.0f} MB")
     if summary["sets_without_shape"]:
-        say(f"holes           {summary['sets_without_shape']} sets without a shape (see {out / SUMMARY})")
-    say(f"report          {out / REPORT}" if report else f"written         {out}")
+        say(f"holes           {summary['sets_without_shape']} sets without a shape (see {job.out / SUMMARY})")
+    say(f"report          {page}" if job.report else f"written         {job.out}")
+
+
+def _run_several(job: Job, flights: Sequence[Flight], *, json: bool) -> None:
+    outcomes = []
+    with _progress() as progress:
+        for outcome in run_flights(job, flights, progress):
+            outcomes.append(outcome)
+            note(f"{outcome.flight.name}: {outcome.state} ({len(outcomes)} of {len(flights)})")
+            for warning in outcome.warnings[:SHOWN_WARNINGS]:
+                note(f"warning: {outcome.flight.name}: {warning}")
+    if json:
+        say_json(read_json_object(job.out / FLIGHTS, "run again"))
+    else:
+        for line in outcome_lines(outcomes):
+            say(line)
+        say(f"written         {job.out / FLIGHTS}")
+    failed = [outcome.flight.name for outcome in outcomes if outcome.state == "failed"]
+    if failed:
+        raise ReconstructError(
+            f"{len(failed)} of {len(flights)} flights failed ({', '.join(failed)}): see {job.out / FLIGHTS}, mend or "
+            "leave them out, and run again; what is done is kept"
+        )
 
 
 @app.command("compare")
@@ -216,7 +243,7 @@ def _sources(flights: list[Path], markers: Path | None) -> tuple[list[Path], Pat
     if markers is None and len(flights) == 1 and tables:
         return [], tables[0]
     if tables:
-        raise UsageError(f"{tables[0]}: a marker table stands alone; give one table, or folders of one flight")
+        raise UsageError(f"{tables[0]}: a marker table stands alone; give one table, or folders of flights")
     if markers is not None and flights:
         raise UsageError("give a flight or --markers, not both")
     if markers is None and not flights:
@@ -225,6 +252,12 @@ def _sources(flights: list[Path], markers: Path | None) -> tuple[list[Path], Pat
         if not path.exists():
             raise UsageError(f"{path}: no such flight folder (nor a command; see reconstruct --help)")
     return flights, markers
+
+
+def _reference(result: Path | None, window: str | None) -> Reference:
+    if result is not None and window is not None:
+        raise UsageError("give --reference or --reference-window, not both")
+    return result if window is None else parse_window(window, "--reference-window")
 
 
 def _check_files(files: dict[str, Path | None]) -> None:

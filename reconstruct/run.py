@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +37,7 @@ from reconstruct.iteration import FEWEST_MARKERS
 from reconstruct.observed import measured_markers
 from reconstruct.reference import Reference
 from reconstruct.report import write_report
-from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_result
+from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_json_object, read_result
 from reconstruct.scene import SCENE, write_scene
 from reconstruct.shared import SharedError, shared_errors
 from reconstruct.stages import Cameras, FitPlan, Key, fit, measure, sampled, take
@@ -100,8 +101,32 @@ class _Clock:
     written: float = 0.0
 
 
-def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Do ``job``; returns the summary as written, and warnings on the recording.
+def check_job(job: Job) -> None:
+    """Raises UsageError or ProcessError for a wing or rig file that cannot be used, before anything is begun."""
+    read_wing(job.wing)
+    if job.rig is not None:
+        Rig.read(job.rig)
+
+
+def finished(job: Job) -> dict[str, Any] | None:
+    """The summary of an earlier run that did the same to the same inputs, and got to its end; None if there is none.
+
+    Which files to write, signals (``max_gap_s``, ``specific_force``) and the words of the command do not count.
+    """
+    if (job.out / PARTS).exists() or not (job.out / SUMMARY).is_file():
+        return None
+    source = _Source(job)
+    plan = _plan(job, read_wing(job.wing), source)
+    source.open()
+    known = read_json_object(job.out / SUMMARY, "remove it, to run again")
+    wanted = json.loads(json.dumps(source.note(plan)))
+    return known if all(known.get(key) == value for key, value in wanted.items() if key != "command") else None
+
+
+def run_job(
+    job: Job, progress: Progress = lambda _: None, hands: Crew | None = None
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Do ``job``, by ``hands`` if there are any; returns the summary as written, and warnings on the recording.
 
     Files of an earlier run in the same folder are replaced, its comparison is removed. What a run that was killed had
     got done is taken up. Raises UsageError when an input is missing or cannot be used, ReconstructError when no set
@@ -110,9 +135,9 @@ def run_job(job: Job, progress: Progress = lambda _: None) -> tuple[dict[str, An
     clock = _Clock(time.monotonic())
     wing = read_wing(job.wing)
     source = _Source(job)
-    plan = FitPlan(wing, job.smooth_s, source.shared, job.reference, cameras=source.cameras() if job.direct else None)
-    plan.of(SIDES[0])  # what cannot be fitted is refused before frames are measured
-    with MemoryWatch() as memory, crew(_workers(job, source), job.scheduler, MODULES) as hands:
+    plan = _plan(job, wing, source)
+    own = crew(_workers(job, source), job.scheduler, MODULES) if hands is None else contextlib.nullcontext(hands)
+    with MemoryWatch() as memory, own as hands:
         clock.first_byte = time.monotonic()
         source.open()
         if job.specific_force is not None:
@@ -262,6 +287,12 @@ class _Source:
             return take(self._table, self.name, store)
         tell = _telling(progress, "markers", self.flight_s)
         return measure(self._recording, self.rig, self._job.settings, store, hands, tell)
+
+
+def _plan(job: Job, wing: Wing, source: _Source) -> FitPlan:
+    plan = FitPlan(wing, job.smooth_s, source.shared, job.reference, cameras=source.cameras() if job.direct else None)
+    plan.of(SIDES[0])  # what cannot be fitted is refused before frames are measured
+    return plan
 
 
 def _write_also(job: Job, store: PartStore, fitted: Sequence[Key], note: Mapping[str, Any]) -> None:

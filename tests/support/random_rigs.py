@@ -45,7 +45,7 @@ def random_rig(seed: int) -> Errors:
     """Errors of the markers that both cameras see, at rest and bent."""
     rng = np.random.default_rng([seed, 0xC0])
     pair, T_body_cam0 = _true_pair(rng)
-    side = _measured_side(rng, pair, T_body_cam0)
+    side = measured_side(rng, pair, T_body_cam0)
     layout = MarkerLayout(STATIONS_M, (0.04, -0.10), 0.004, LIGHT)
     true_light = (
         rng.normal(LIGHT.standoff_m, LIGHT.standoff_sigma_m),
@@ -79,21 +79,8 @@ def random_rig(seed: int) -> Errors:
     return Errors(error[1][seen], point[seen], (error[1] - error[0])[seen], moved[seen])
 
 
-def _true_pair(rng):
-    focal = rng.uniform(1300.0, 2000.0)
-    cameras = []
-    for _ in range(2):
-        fx, (cx, cy) = focal * (1 + rng.normal(0.0, 0.005)), np.array([1039.5, 775.5]) + rng.normal(0.0, 8.0, 2)
-        lens = [-0.1 + rng.normal(0, 0.01), 0.02 + rng.normal(0, 0.005), *rng.normal(0, 3e-4, 2), rng.normal(0, 5e-4)]
-        cameras.append(CameraModel(*SIZE, [[fx, 0, cx], [0, fx * (1 + rng.normal(0, 5e-4)), cy], [0, 0, 1]], lens))
-    between = pose_matrix(rng.normal(0.0, 0.01, 3), [-rng.uniform(0.2, 0.4), *rng.normal(0.0, 0.002, 2)])
-    pair = StereoPair(*cameras, between)
-    nominal = approximate_pose(pair, np.array([0.03, -0.2, 0.08]), np.array([0.0, 0.99, 0.12]))
-    return pair, nominal @ pose_matrix(rng.normal(0.0, 0.01, 3), rng.normal(0.0, 0.005, 3))
-
-
-def _measured_side(rng, pair, T_body_cam0):
-    """The rig's side as `wingproc calibrate` and `wingproc rig` make it."""
+def measured_side(rng: np.random.Generator, pair: StereoPair, T_body_cam0: np.ndarray) -> RigSide:
+    """The rig's side as `wingproc calibrate` and `wingproc rig` make it, of a pair that truly is as given."""
     printed = BOARD.points_m + rng.normal(0.0, PRINT_SIGMA_M, BOARD.points_m.shape)
     corners = np.array([_board_view(rng, pair, printed) for _ in range(VIEWS)]).transpose(1, 0, 2, 3)
     corners += rng.normal(0.0, rng.uniform(0.01, 0.05), corners.shape)
@@ -111,6 +98,19 @@ def _measured_side(rng, pair, T_body_cam0):
     names, sigma = [f"P{k}" for k in range(len(places))], np.full(len(places), SURVEY_SIGMA_M)
     fit = solve_pose(calibrated, near, names, surveyed, sigma, *spots)
     return RigSide(calibrated, fit.T_body_cam0, "0", "1", 0.0, fit.covariance, fit.by_calibration)
+
+
+def _true_pair(rng):
+    focal = rng.uniform(1300.0, 2000.0)
+    cameras = []
+    for _ in range(2):
+        fx, (cx, cy) = focal * (1 + rng.normal(0.0, 0.005)), np.array([1039.5, 775.5]) + rng.normal(0.0, 8.0, 2)
+        lens = [-0.1 + rng.normal(0, 0.01), 0.02 + rng.normal(0, 0.005), *rng.normal(0, 3e-4, 2), rng.normal(0, 5e-4)]
+        cameras.append(CameraModel(*SIZE, [[fx, 0, cx], [0, fx * (1 + rng.normal(0, 5e-4)), cy], [0, 0, 1]], lens))
+    between = pose_matrix(rng.normal(0.0, 0.01, 3), [-rng.uniform(0.2, 0.4), *rng.normal(0.0, 0.002, 2)])
+    pair = StereoPair(*cameras, between)
+    nominal = approximate_pose(pair, np.array([0.03, -0.2, 0.08]), np.array([0.0, 0.99, 0.12]))
+    return pair, nominal @ pose_matrix(rng.normal(0.0, 0.01, 3), rng.normal(0.0, 0.005, 3))
 
 
 def _board_view(rng, pair, printed):

@@ -6,6 +6,7 @@ What it draws is what ``wingsim rig`` would have delivered; only the waiting is 
 
 import argparse
 import multiprocessing
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from capture.recorder import camera_channels
 from capture.ring import Ring
 from capture.segment import FrameLayout, SegmentWriter
 from capture.trigger_protocol import Pulse
-from hw_sim.render import LiveRenderer, noise_frames
+from hw_sim.render import LiveRenderer, Pixels, noise_frames
 from hw_sim.truth import AROUND_NS, write_truth
 from hw_sim.world import World
 from process.camera_model import CameraModel, MarkerLayout, Rig, RigSide, StereoPair
@@ -37,7 +38,7 @@ def write_flight(world: World, folder: Path, seconds: float, sunlit: Stretch = (
         pool.starmap(
             _write_side, [(world, side, own, seconds, sunlit) for side, own in zip(SIDES, folders, strict=True)]
         )
-    edges = [_edge_ns(world, trigger) for trigger in range(_triggers(world, seconds))]
+    edges = [edge_ns(world, trigger) for trigger in range(_triggers(world, seconds))]
     pulses = [Pulse(index, index, edge, edge) for index, edge in enumerate(edges)]
     write_truth(world, edges[0] - AROUND_NS, edges[-1] + AROUND_NS, folder / "truth", pulses)
     return folders[0], folders[1]
@@ -45,60 +46,76 @@ def write_flight(world: World, folder: Path, seconds: float, sunlit: Stretch = (
 
 def true_rig(world: World) -> Rig:
     """The rig file that a calibration without any error would give."""
-    sides = {}
-    for side in SIDES:
-        cam0, cam1 = (camera for camera in world.cameras if camera.side == side)
-        poses = [np.array(camera.T_body_cam) for camera in (cam0, cam1)]
-        models = [
-            CameraModel.from_intrinsics(
-                world.sensor.width_px,
-                world.sensor.height_px,
-                [one.fx, one.fy, one.cx, one.cy, one.k1, one.k2, one.p1, one.p2, one.k3],
-            )
-            for one in (cam0, cam1)
-        ]
-        pair = StereoPair(models[0], models[1], np.linalg.inv(poses[1]) @ poses[0])
-        sides[side] = RigSide(pair, poses[0], cam0.serial, cam1.serial, cam0.row_time_us * 1e3)
     leds = world.leds
-    return Rig(sides["left"], sides["right"], MarkerLayout(leds.pairs_station_m, leds.chord_m, leds.height_m))
+    layout = MarkerLayout(leds.pairs_station_m, leds.chord_m, leds.height_m)
+    return Rig(true_side(world, "left"), true_side(world, "right"), layout)
+
+
+def true_side(world: World, side: str) -> RigSide:
+    """One side of it."""
+    cam0, cam1 = (camera for camera in world.cameras if camera.side == side)
+    poses = [np.array(camera.T_body_cam) for camera in (cam0, cam1)]
+    models = [
+        CameraModel.from_intrinsics(
+            world.sensor.width_px,
+            world.sensor.height_px,
+            [one.fx, one.fy, one.cx, one.cy, one.k1, one.k2, one.p1, one.p2, one.k3],
+        )
+        for one in (cam0, cam1)
+    ]
+    pair = StereoPair(models[0], models[1], np.linalg.inv(poses[1]) @ poses[0])
+    return RigSide(pair, poses[0], cam0.serial, cam1.serial, cam0.row_time_us * 1e3)
 
 
 def _triggers(world: World, seconds: float) -> int:
     return round(seconds * world.trigger_rate_hz)
 
 
-def _edge_ns(world: World, trigger: int) -> int:
+def edge_ns(world: World, trigger: int) -> int:
+    """When a trigger comes, and row 0 of its frames opens."""
     return world.epoch_ns + round((trigger + 1) * 1e9 / world.trigger_rate_hz)
 
 
 def _write_side(world: World, side: str, folder: Path, seconds: float, sunlit: Stretch) -> None:
+    scenes = (world, replace(world, scene=replace(world.scene, background="sunlit")))
+    artists: list[dict[str, LiveRenderer]] = []
+    for scene in scenes:
+        cameras = [camera for camera in world.cameras if camera.side == side]
+        noise = noise_frames(scene, cameras[0].exposure_us, cameras[0].gain_db)
+        artists.append({one.name: LiveRenderer(scene, one, noise, one.exposure_us, one.gain_db) for one in cameras})
+
+    def draw(camera: str, trigger: int, pixels: Pixels) -> None:
+        in_sun = sunlit[0] <= trigger / world.trigger_rate_hz < sunlit[1]
+        artists[in_sun][camera].render(edge_ns(world, trigger), pixels)
+
+    write_side(world, side, folder, range(_triggers(world, seconds)), draw)
+
+
+def write_side(
+    world: World, side: str, folder: Path, triggers: Sequence[int], draw: Callable[[str, int, Pixels], None]
+) -> None:
+    """Write one side's recording of these triggers; ``draw`` gets a camera, a trigger, and the pixels to fill."""
     cameras = [camera for camera in world.cameras if camera.side == side]
     width, height = world.sensor.width_px, world.sensor.height_px
-    scenes = (world, replace(world, scene=replace(world.scene, background="sunlit")))
-    noise = [noise_frames(scene, cameras[0].exposure_us, cameras[0].gain_db) for scene in scenes]
-    artists = [
-        [LiveRenderer(scene, camera, drawn, camera.exposure_us, camera.gain_db) for camera in cameras]
-        for scene, drawn in zip(scenes, noise, strict=True)
-    ]
     layouts = [FrameLayout(3 * at + 1, 3 * at + 2, f"{side}_{name}", width, height) for at, name in enumerate(CAMERAS)]
     ring = Ring(1, layouts[0].slot_bytes, lock_memory=False)
     slot = ring.slot(0)
+    name = folder.parent.name
+    provenance = {"side": side, "flight": name, "flight_id": f"{name}-{world.epoch_ns:x}"}
     writer = None
-    for trigger in range(_triggers(world, seconds)):
-        if trigger % round(SEGMENT_S * world.trigger_rate_hz) == 0:
+    for count, trigger in enumerate(triggers):
+        if count % round(SEGMENT_S * world.trigger_rate_hz) == 0:
             if writer is not None:
                 writer.close()
-            path = folder / f"{side}_{trigger // round(SEGMENT_S * world.trigger_rate_hz):04d}.mcap"
-            writer = SegmentWriter(SystemDisk(), path, camera_channels(CAMERAS, side), {"side": side})
+            path = folder / f"{side}_{count // round(SEGMENT_S * world.trigger_rate_hz):04d}.mcap"
+            writer = SegmentWriter(SystemDisk(), path, camera_channels(CAMERAS, side), provenance)
         assert writer is not None
-        in_sun = sunlit[0] <= trigger / world.trigger_rate_hz < sunlit[1]
-        for camera, artist, layout in zip(cameras, artists[in_sun], layouts, strict=True):
-            edge_ns = _edge_ns(world, trigger)
-            pixels = np.frombuffer(layout.pixels(slot), np.uint8).reshape(height, width)
-            artist.render(edge_ns, pixels)
+        for camera, layout in zip(cameras, layouts, strict=True):
+            start_ns = edge_ns(world, trigger)
+            draw(camera.name, trigger, np.frombuffer(layout.pixels(slot), np.uint8).reshape(height, width))
             row_time_ns = round(camera.row_time_us * 1000)
             frame = Frame(
-                trigger, trigger, edge_ns, edge_ns, edge_ns, edge_ns + 25_000_000, 1000, camera.exposure_us,
+                trigger, trigger, start_ns, start_ns, start_ns, start_ns + 25_000_000, 1000, camera.exposure_us,
                 row_time_ns, 1, 1000, camera.gain_db, 9, 0,
             )  # fmt: skip
             middle_ns = frame.mid_exposure_ns + (height - 1) * row_time_ns // 2
