@@ -1,6 +1,5 @@
 """A result → the figures of its report: the wing, its motion, and how well model and markers agree."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from reconstruct.result import Result, SideResult
+from reconstruct.shown import DETAIL_S, Heights, highest_ns, leading
 from reconstruct.tables import Floats, Ints, rms
 
 COLOURS = {"left": "#2a6496", "right": "#b5502a"}
@@ -38,7 +38,6 @@ STYLE: dict[str, Any] = {
     "savefig.dpi": 150,
 }
 WIDTH_IN = 8.4
-DETAIL_S = 20.0  # of a longer flight, so much is drawn in detail
 DRAWN_SETS = 600  # more in one curve are drawn as mean and range
 
 
@@ -48,16 +47,15 @@ def wing_3d(result: Result) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, height_in))
     tall = wide * WIDTH_IN / height_in
     axes: Any = figure.add_axes((0.5 - wide / 2, 0.46 - tall / 2, wide, tall), projection="3d", computed_zorder=False)
+    first = _first(result)
     for side in result.sides.values():
-        axes.plot(
-            *side.unloaded_xyz_m.T, color=GREY, linewidth=2.2, label="unloaded" if side is _first(result) else None
-        )
-    for (name, triggers), colour in zip(chosen_sets(result).items(), INSTANT_COLOURS, strict=False):
-        for side in result.sides.values():
-            rows = np.flatnonzero(side.shape.trigger_index == triggers[side.shape.side])
-            label = f"{name}, {seconds(result, side)[rows[0]]:.2f} s" if side is _first(result) else None
-            axes.plot(*side.shape.xyz_m[rows[0]].T, color=colour, linewidth=1.8, label=label)
-            _ribs(axes, side, int(triggers[side.shape.side]), colour)
+        axes.plot(*side.unloaded_xyz_m.T, color=GREY, linewidth=2.2, label="unloaded" if side is first else None)
+    for (name, triggers), colour in zip(result.shown.instants.items(), INSTANT_COLOURS, strict=False):
+        for which, side in result.sides.items():
+            shape, row = side.sample.shape, _row(side, triggers[which])
+            label = f"{name}, {(shape.timestamp_ns[row] - result.start_ns) * 1e-9:.2f} s" if side is first else None
+            axes.plot(*shape.xyz_m[row].T, color=colour, linewidth=1.8, label=label)
+            _ribs(axes, side, row, colour)
     _equal_box(axes, result)
     axes.set_xticks([])  # the chord is too short for a scale
     axes.view_init(elev=16, azim=-22)  # from behind and a little to the left
@@ -67,13 +65,12 @@ def wing_3d(result: Result) -> Figure:
 
 def is_long(result: Result) -> bool:
     """Whether single oscillations can no longer be told apart in a figure of the whole flight."""
-    return bool(np.ptp(np.concatenate([seconds(result, side) for side in result.sides.values()])) > DETAIL_S)
+    return (result.end_ns - result.start_ns) * 1e-9 > DETAIL_S
 
 
 def tip(result: Result) -> Figure:
     """Displacement of the tip and its twist in time, with bands of two sigma; of a long flight around its highest."""
-    first = _first(result)
-    start = seconds(result, first)[np.nanargmax(first.frames["tip_dz_m"])] - DETAIL_S / 2
+    start = (highest_ns(_heights(result)) - result.start_ns) * 1e-9 - DETAIL_S / 2
     return _tip(result, (start, start + DETAIL_S) if is_long(result) else (-np.inf, np.inf))
 
 
@@ -102,15 +99,17 @@ def span(result: Result) -> Figure:
     """Vertical displacement and twist along the span: all sets as bands, chosen instants as lines."""
     figure = Figure(figsize=(WIDTH_IN, 4.9), layout="constrained")
     grid = figure.subplots(2, len(result.sides), sharex="col", sharey="row", squeeze=False)
-    instants = chosen_sets(result)
     for column, (name, side) in enumerate(result.sides.items()):
-        lift = 1e3 * (side.shape.xyz_m - side.reference_xyz_m)[..., 2]
-        twist = side.shape.twist_deg - side.reference_twist_deg
-        for axis, values in zip(grid[:, column], (lift, twist), strict=True):
-            _envelope(axis, side.shape.s_m, values)
-            for (label, triggers), colour in zip(instants.items(), INSTANT_COLOURS, strict=False):
-                row = np.flatnonzero(side.shape.trigger_index == triggers[name])[0]
-                axis.plot(side.shape.s_m, values[row], color=colour, label=label)
+        shape = side.sample.shape
+        even = _even_rows(result, side)
+        lift = 1e3 * (shape.xyz_m - side.reference_xyz_m)[..., 2]
+        twist = shape.twist_deg - side.reference_twist_deg
+        lift_range = 1e3 * (side.z_range_m - side.reference_xyz_m[:, 2])
+        ranges = (lift_range, side.twist_range_deg - side.reference_twist_deg)
+        for axis, values, outer in zip(grid[:, column], (lift, twist), ranges, strict=True):
+            _envelope(axis, shape.s_m, values[even], outer)
+            for (label, triggers), colour in zip(result.shown.instants.items(), INSTANT_COLOURS, strict=False):
+                axis.plot(shape.s_m, values[_row(side, triggers[name])], color=colour, label=label)
             axis.axhline(0.0, color=GREY, linewidth=1.0, zorder=1)
         grid[0, column].set(title=f"{name.capitalize()} wing: displacement, up")
         grid[1, column].set(title=f"{name.capitalize()} wing: twist", xlabel="along the span s, m")
@@ -126,12 +125,13 @@ def sigmas(result: Result) -> Figure:
     """What the fit states of its own uncertainty, along the span (median over all sets)."""
     figure, axes = panels(1, 2, 2.7, sharex=False)
     for name, side in result.sides.items():
-        fitted = np.isfinite(side.shape.xyz_m).all(axis=(1, 2))
-        if not fitted.any():
+        shape, even = side.sample.shape, _even_rows(result, side)
+        fitted = even[np.isfinite(shape.xyz_m[even]).all(axis=(1, 2))]
+        if not fitted.size:
             continue
-        distance = np.linalg.norm(side.shape.sigma_xyz_m[fitted], axis=-1)
-        axes[0].plot(side.shape.s_m, 1e3 * np.median(distance, axis=0), color=COLOURS[name], label=name)
-        axes[1].plot(side.shape.s_m, np.median(side.shape.sigma_twist_deg[fitted], axis=0), color=COLOURS[name])
+        distance = np.linalg.norm(shape.sigma_xyz_m[fitted], axis=-1)
+        axes[0].plot(shape.s_m, 1e3 * np.median(distance, axis=0), color=COLOURS[name], label=name)
+        axes[1].plot(shape.s_m, np.median(shape.sigma_twist_deg[fitted], axis=0), color=COLOURS[name])
     axes[0].set(title="One sigma of the position", xlabel="along the span s, m", ylabel="mm", ylim=(0, None))
     axes[1].set(title="One sigma of the twist", xlabel="along the span s, m", ylabel="deg", ylim=(0, None))
     axes[0].legend(loc="upper left")
@@ -150,19 +150,6 @@ def residuals_in_time(result: Result) -> Figure:
     axes[1].set(title="χ² a degree of freedom (1: as the stated noise)", xlabel=time_label(result), ylim=(0, None))
     legend(axes[0])
     return figure
-
-
-def residuals_by_marker(result: Result) -> Figure:
-    """RMS residual of each marker over all sets, on the wing's plan."""
-    values = {name: 1e3 * rms(np.linalg.norm(side.residual_m, axis=-1), axis=0) for name, side in result.sides.items()}
-    markers = {name: side.residual_marker for name, side in result.sides.items()}
-    return marker_map(markers, values, "RMS residual, mm", "{:.2f}", "YlOrBr")
-
-
-def markers_seen(result: Result) -> Figure:
-    """Share of the sets in which each marker was measured, on the wing's plan."""
-    values = {name: 100.0 * side.markers.seen.mean(axis=0) for name, side in result.sides.items()}
-    return marker_map(_measured(result), values, "measured in … % of the sets", "{:.0f}", "Blues", limits=(0.0, 220.0))
 
 
 def loads(result: Result) -> Figure:
@@ -184,10 +171,9 @@ def error_in_time(result: Result) -> Figure:
     figure, axes = panels(3, 1, 5.2)
     for name, errors in result.errors.items():
         time = np.asarray((errors.timestamp_ns - result.start_ns) * 1e-9, dtype=np.float64)
-        distance = 1e3 * np.linalg.norm(errors.shape_m, axis=-1)
-        curve(axes[0], time, rms(distance, axis=1), name)
-        curve(axes[1], time, distance[:, -1], name)
-        curve(axes[2], time, rms(errors.twist_deg, axis=1), name)
+        curve(axes[0], time, 1e3 * errors.shape_rms_m, name)
+        curve(axes[1], time, 1e3 * errors.tip_m, name)
+        curve(axes[2], time, errors.twist_rms_deg, name)
     axes[0].set(title="Shape error (RMS over the stations)", ylabel="mm", ylim=(0, None))
     axes[1].set(title="Tip error (3-D distance)", ylabel="mm", ylim=(0, None))
     axes[2].set(title="Twist error (RMS over the stations)", ylabel="deg", ylim=(0, None), xlabel=time_label(result))
@@ -199,16 +185,15 @@ def error_along_span(result: Result) -> Figure:
     """RMS error along the span (solid) beside the sigma that the fit states (dashed)."""
     figure, axes = panels(1, 2, 2.9, sharex=False)
     for name, errors in result.errors.items():
-        shape = result.sides[name].shape
-        known = np.isfinite(errors.shape_m).all(axis=-1)
-        stated = np.where(known, np.linalg.norm(shape.sigma_xyz_m, axis=-1), np.nan)
-        axes[0].plot(
-            shape.s_m, 1e3 * rms(np.linalg.norm(errors.shape_m, axis=-1), axis=0), color=COLOURS[name], label=name
-        )
-        axes[0].plot(shape.s_m, 1e3 * rms(stated, axis=0), color=COLOURS[name], linestyle="--", linewidth=1.0)
-        axes[1].plot(shape.s_m, rms(errors.twist_deg, axis=0), color=COLOURS[name])
-        stated_twist = np.where(known, shape.sigma_twist_deg, np.nan)
-        axes[1].plot(shape.s_m, rms(stated_twist, axis=0), color=COLOURS[name], linestyle="--", linewidth=1.0)
+        side = result.sides[name]
+        shape, even = side.sample.shape, _even_rows(result, side)
+        sigma_mm = 1e3 * rms(np.linalg.norm(shape.sigma_xyz_m[even], axis=-1), axis=0)
+        stated = (sigma_mm, rms(shape.sigma_twist_deg[even], axis=0))
+        found = (1e3 * errors.along_rms_m, errors.along_twist_rms_deg)
+        for axis, error, sigma in zip(axes, found, stated, strict=True):
+            axis.plot(side.s_m, error, color=COLOURS[name], label=name)
+            shown = np.where(np.isfinite(error), sigma, np.nan)
+            axis.plot(side.s_m, shown, color=COLOURS[name], linestyle="--", linewidth=1.0)
     axes[0].plot([], [], color="#555555", linestyle="--", linewidth=1.0, label="stated sigma")
     axes[0].set(title="Position error (RMS)", xlabel="along the span s, m", ylabel="mm", ylim=(0, None))
     axes[1].set(title="Twist error (RMS)", xlabel="along the span s, m", ylabel="deg", ylim=(0, None))
@@ -216,85 +201,31 @@ def error_along_span(result: Result) -> Figure:
     return figure
 
 
-def error_by_marker(result: Result) -> Figure:
-    """RMS 3-D error of each measured marker against the reference, on the wing's plan."""
-    values = {
-        name: 1e3 * rms(np.linalg.norm(errors.marker_m, axis=-1), axis=0) for name, errors in result.errors.items()
+def _row(side: SideResult, trigger: int) -> int:
+    """Of the sample, which has it."""
+    return int(side.sample.rows(np.array([trigger]))[0])
+
+
+def _even_rows(result: Result, side: SideResult) -> Ints:
+    """Rows of the sample that are evenly spread over the flight."""
+    rows = side.sample.rows(result.shown.tracks[0].trigger_index)
+    return rows[rows >= 0]
+
+
+def _heights(result: Result) -> dict[str, Heights]:
+    return {
+        name: Heights(side.trigger_index, side.timestamp_ns, side.frames["tip_dz_m"])
+        for name, side in result.sides.items()
     }
-    return marker_map(_measured(result), values, "RMS 3-D error, mm", "{:.2f}", "YlOrBr")
-
-
-def marker_map(
-    markers: Mapping[str, Ints],
-    values: Mapping[str, Floats],
-    label: str,
-    text: str,
-    colours: str,
-    limits: tuple[float, float] | None = None,
-) -> Figure:
-    """A number a marker on the plan of the wing: left tip … root … right tip, fore row above aft row."""
-    pairs = 1 + max(int(own.max()) // 2 for own in markers.values())
-    plan = np.full((2, 2 * pairs), np.nan)
-    for name in values:
-        for marker, value in zip(markers[name], values[name], strict=True):
-            pair, row = divmod(int(marker), 2)
-            plan[row, pairs + pair if name == "right" else pairs - 1 - pair] = value
-    figure = Figure(figsize=(WIDTH_IN, 1.75), layout="constrained")
-    axes = figure.subplots()
-    top = np.nanmax(plan) if np.isfinite(plan).any() else 1.0
-    low, high = limits or (0.0, 2.2 * max(float(top), 1e-9))
-    axes.imshow(plan, cmap=colours, vmin=low, vmax=high, aspect="auto")
-    for (row, column), value in np.ndenumerate(plan):
-        shown = text.format(value) if np.isfinite(value) else "–"
-        axes.text(column, row, shown, ha="center", va="center", fontsize=8, color="#222222")
-    axes.axvline(pairs - 0.5, color="white", linewidth=5)
-    axes.set_xticks(range(2 * pairs), [str(pair) for pair in (*range(pairs - 1, -1, -1), *range(pairs))])
-    axes.set_yticks([0, 1], ["fore", "aft"])
-    axes.set_xlabel("left wing ←      pair, 0 at the root      → right wing")
-    axes.set_title(label)
-    axes.grid(False)
-    axes.tick_params(length=0)
-    axes.spines[:].set_visible(False)
-    return figure
-
-
-def _measured(result: Result) -> dict[str, Ints]:
-    return {name: side.markers.marker for name, side in result.sides.items()}
-
-
-def chosen_sets(result: Result) -> dict[str, dict[str, int]]:
-    """Name → trigger index by side: the lowest, the middle and the highest tip seen (fewer when sets are few).
-
-    Taken on the first side; the other side's is the fitted set nearest in trigger index.
-    """
-    first = _first(result)
-    fitted = np.flatnonzero(np.isfinite(first.frames["tip_dz_m"]))
-    if fitted.size == 0:
-        return {}
-    order = fitted[np.argsort(first.frames["tip_dz_m"][fitted], kind="stable")]
-    rows = {"lowest": order[0], "middle": order[order.size // 2], "highest": order[-1]}
-    if order.size < 3:
-        rows = {"lowest": order[0]} if order.size == 1 else {"lowest": order[0], "highest": order[-1]}
-    chosen: dict[str, dict[str, int]] = {}
-    for name, row in rows.items():
-        wanted = int(first.shape.trigger_index[row])
-        chosen[name] = {key: _nearest_fitted(side, wanted) for key, side in result.sides.items()}
-    return chosen
-
-
-def _nearest_fitted(side: SideResult, trigger: int) -> int:
-    fitted = np.isfinite(side.frames["tip_dz_m"])
-    known = side.shape.trigger_index[fitted] if fitted.any() else side.shape.trigger_index
-    return int(known[np.argmin(np.abs(known - trigger))])
 
 
 def _first(result: Result) -> SideResult:
-    """The side with the most fitted sets: the one that instants are chosen on."""
-    return max(result.sides.values(), key=lambda side: int(np.isfinite(side.frames["tip_dz_m"]).sum()))
+    """The side that instants are chosen on."""
+    return result.sides[leading(_heights(result))]
 
 
 def seconds(result: Result, side: SideResult) -> Floats:
-    return np.asarray((side.shape.timestamp_ns - result.start_ns) * 1e-9, dtype=np.float64)
+    return np.asarray((side.timestamp_ns - result.start_ns) * 1e-9, dtype=np.float64)
 
 
 def time_label(result: Result) -> str:
@@ -339,23 +270,21 @@ def legend(axis: Axes) -> None:
     axis.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2, borderaxespad=0.0)
 
 
-def _envelope(axis: Axes, s_m: Floats, values: Floats) -> None:
+def _envelope(axis: Axes, s_m: Floats, values: Floats, outer: Floats) -> None:
     known = values[np.isfinite(values).all(axis=1)]
     if known.shape[0] == 0:
         return
-    low, q05, q95, high = np.percentile(known, (0, 5, 95, 100), axis=0)
-    axis.fill_between(s_m, low, high, color="#eceef0", linewidth=0, label="all sets")
+    q05, q95 = np.percentile(known, (5, 95), axis=0)
+    axis.fill_between(s_m, *outer, color="#eceef0", linewidth=0, label="all sets")
     axis.fill_between(s_m, q05, q95, color="#d9dde1", linewidth=0, label="90 % of the sets")
 
 
-def _ribs(axes: Any, side: SideResult, trigger: int, colour: str) -> None:
+def _ribs(axes: Any, side: SideResult, row: int, colour: str) -> None:
     """Measured markers as dots, joined fore to aft: they show the chord and its twist."""
-    row = np.flatnonzero(side.markers.trigger_index == trigger)
-    if row.size == 0:
-        return
-    xyz = side.markers.xyz_m[row[0]]
+    markers = side.sample.markers
+    xyz = markers.xyz_m[row]
     axes.scatter(*xyz.T, color=colour, s=5, linewidths=0, depthshade=False)
-    place = {int(marker): at for at, marker in enumerate(side.markers.marker)}
+    place = {int(marker): at for at, marker in enumerate(markers.marker)}
     for marker, at in place.items():
         if marker % 2 == 0 and marker + 1 in place:
             axes.plot(*xyz[[at, place[marker + 1]]].T, color=colour, linewidth=0.9)
@@ -365,7 +294,13 @@ def _equal_box(axes: Any, result: Result) -> None:
     """One metre is as long on every axis; panes and grid stay in the background."""
     points = np.concatenate(
         [
-            np.concatenate([side.shape.xyz_m.reshape(-1, 3), side.unloaded_xyz_m, side.markers.xyz_m.reshape(-1, 3)])
+            np.concatenate(
+                [
+                    side.sample.shape.xyz_m.reshape(-1, 3),
+                    side.unloaded_xyz_m,
+                    side.sample.markers.xyz_m.reshape(-1, 3),
+                ]
+            )
             for side in result.sides.values()
         ]
     )

@@ -1,10 +1,8 @@
 """A result → one self-contained HTML page: verdict, figures with captions, tables; nothing is loaded from elsewhere."""
 
-import base64
-import html
 import io
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from capture.errors import ReconstructError
-from reconstruct import figures, signal_figure
+from reconstruct import figures, marker_maps, page, signal_figure
+from reconstruct.page import number, table, text
 from reconstruct.result import FIGURES, REPORT, Result
 from reconstruct.summary import verdict
+from reconstruct.wing_view import wing_view
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,13 @@ PLATES = (
         "How well the model agrees with the markers",
         "The same, marker by marker. A marker that stands out is mounted, matched or calibrated differently from what "
         "the wing file says.",
-        figures.residuals_by_marker,
+        marker_maps.residuals_by_marker,
+    ),
+    Plate(
+        "residuals-map",
+        "How well the model agrees with the markers",
+        "The same in time: a column that stands out is a moment, a row a marker.",
+        marker_maps.residuals_map,
     ),
     Plate(
         "sigmas",
@@ -99,7 +105,13 @@ PLATES = (
         "markers-seen",
         "What was measured",
         "Share of the sets in which a marker was found in both cameras and triangulated.",
-        figures.markers_seen,
+        marker_maps.markers_seen,
+    ),
+    Plate(
+        "markers-map",
+        "What was measured",
+        "The same in time. White is a marker, or a moment, that the cameras did not see.",
+        marker_maps.markers_map,
     ),
 )
 COMPARED_PLATES = (
@@ -120,7 +132,7 @@ COMPARED_PLATES = (
         "error-by-marker",
         "Error against the reference",
         "RMS distance of the measured markers from the reference's, each at its own instant.",
-        figures.error_by_marker,
+        marker_maps.error_by_marker,
     ),
 )
 
@@ -134,7 +146,8 @@ def write_report(result: Result, folder: Path) -> Path:
     if not any(np.isfinite(side.frames["tip_dz_m"]).any() for side in result.sides.values()):
         raise ReconstructError(f"{result.folder}: no set was fitted, there is nothing to report; see frames.parquet")
     (folder / FIGURES).mkdir(parents=True, exist_ok=True)
-    sections: dict[str, list[str]] = {}
+    view = wing_view(result)
+    sections: dict[str, list[str]] = {"The wing": [view.html], "Error against the reference": []}
     for plate in (*COMPARED_PLATES, *PLATES):
         file = folder / FIGURES / f"{plate.name}.png"
         file.unlink(missing_ok=True)
@@ -142,15 +155,15 @@ def write_report(result: Result, folder: Path) -> Path:
             continue
         png = _draw(plate, result)
         file.write_bytes(png)
-        sections.setdefault(plate.section, []).append(_figure(plate, png))
+        sections.setdefault(plate.section, []).append(page.picture(plate.name, plate.caption, png))
     if result.comparison is not None:
         sections["Error against the reference"].append(_marker_table(result.comparison))
     sections["What was measured"].append(_ledger(result))
     body = [_head(result)]
-    body += [f"<section><h2>{_text(title)}</h2>{''.join(parts)}</section>" for title, parts in sections.items()]
+    body += [f"<section><h2>{text(title)}</h2>{''.join(parts)}</section>" for title, parts in sections.items() if parts]
     body.append(_made_from(result))
     path = folder / REPORT
-    path.write_text(_PAGE.format(title=_text(_title(result)), style=_STYLE, body="\n".join(body)), encoding="utf-8")
+    path.write_text(page.page(_title(result), body, view.script), encoding="utf-8")
     return path
 
 
@@ -163,15 +176,6 @@ def _draw(plate: Plate, result: Result) -> bytes:
     return buffer.getvalue()
 
 
-def _figure(plate: Plate, png: bytes) -> str:
-    data = base64.b64encode(png).decode("ascii")
-    alt = _text(plate.name.replace("-", " "))
-    return (
-        f'<figure id="{plate.name}"><img alt="{alt}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{_text(plate.caption)}</figcaption></figure>"
-    )
-
-
 def _title(result: Result) -> str:
     return f"Wing shape in flight: {result.summary.get('wing', result.folder.name)}"
 
@@ -181,25 +185,25 @@ def _head(result: Result) -> str:
     words = verdict(summary)
     grade = {"Good.": "good", "Poor.": "poor"}.get(words[0], "care")
     when = str(summary["start_utc"])[:19].replace("T", " ")
-    amount = f"{summary['duration_s']:.1f} s, {summary['triggers']} triggers, {_and(summary['sides'])} wing"
+    amount = f"{summary['duration_s']:.1f} s, {summary['triggers']} triggers, {' and '.join(summary['sides'])} wing"
     sub = f"{when} UTC, {amount}; displacements are from the {result.reference}"
     cards = [
         ("sets fitted", f"{summary['converged_percent']:.1f} %", f"of {summary['sets']}"),
         ("markers measured", f"{summary['markers_seen_percent']:.1f} %", "of all markers in all sets"),
-        ("residual", _number(summary["residual_rms_mm"], "mm"), "RMS, measured to fitted"),
-        ("tip known to", _number(summary["sigma_tip_mm"], "mm"), "one sigma, median"),
-        ("tip twist known to", _number(summary["sigma_tip_twist_deg"], "°"), "one sigma, median"),
+        ("residual", number(summary["residual_rms_mm"], "mm"), "RMS, measured to fitted"),
+        ("tip known to", number(summary["sigma_tip_mm"], "mm"), "one sigma, median"),
+        ("tip twist known to", number(summary["sigma_tip_twist_deg"], "°"), "one sigma, median"),
     ]
     parts = [
-        f"<header><h1>{_text(_title(result))}</h1><p class='sub'>{_text(sub)}</p></header>",
-        f"<p class='verdict {grade}'><strong>{_text(words[0])}</strong> {_text(' '.join(words[1:]))}</p>",
-        _cards(cards),
+        f"<header><h1>{text(_title(result))}</h1><p class='sub'>{text(sub)}</p></header>",
+        f"<p class='verdict {grade}'><strong>{text(words[0])}</strong> {text(' '.join(words[1:]))}</p>",
+        page.cards(cards),
     ]
     if result.comparison is not None:
         parts.append(_compared_head(result.comparison))
     columns = ("", *result.summary["sides"])
     rows = [
-        (label, *(_number(summary["by_side"][side][key], unit) for side in summary["sides"]))
+        (label, *(number(summary["by_side"][side][key], unit) for side in summary["sides"]))
         for label, key, unit in (
             ("sets fitted", "converged_percent", "%"),
             ("markers measured", "markers_seen_percent", "%"),
@@ -210,7 +214,7 @@ def _head(result: Result) -> str:
             ("sigma of the tip's twist, median", "sigma_tip_twist_deg", "°"),
         )
     ]
-    parts.append(_table(columns, [*rows, *_stiffness_rows(summary), *_rest_rows(summary)]))
+    parts.append(table(columns, [*rows, *_stiffness_rows(summary), *_rest_rows(summary)]))
     return "".join(parts)
 
 
@@ -222,7 +226,7 @@ def _stiffness_rows(summary: Any) -> list[tuple[str, ...]]:
         for side in summary["sides"]:
             change = summary["by_side"][side].get("stiffness_change_percent", {}).get(key)
             sigma = summary["by_side"][side].get("sigma_stiffness_percent", {}).get(key)
-            cells.append(f"{_number(change, '%', sign=True)} ± {_number(sigma, '%')}" if change and sigma else "–")
+            cells.append(f"{number(change, '%', sign=True)} ± {number(sigma, '%')}" if change and sigma else "–")
         if any(cell != "–" for cell in cells):
             rows.append((f"{key} found, against the wing file", *cells))
     return rows
@@ -236,23 +240,23 @@ def _rest_rows(summary: Any) -> list[tuple[str, ...]]:
     cells = []
     for side in summary["sides"]:
         here = found.get(side)
-        sigma = here and _number(here["sigma_softer_percent"], "%")
-        cells.append(f"{_number(here['softer_percent'], '%', sign=True)} ± {sigma}" if here else "–")
+        sigma = here and number(here["sigma_softer_percent"], "%")
+        cells.append(f"{number(here['softer_percent'], '%', sign=True)} ± {sigma}" if here else "–")
     return [("softer at rest, under its weight, than the wing file", *cells)]
 
 
 def _compared_head(comparison: Any) -> str:
     cards = [
-        ("marker error", _number(comparison["marker_rms_mm"], "mm"), "3-D, RMS"),
-        ("shape error", _number(comparison["shape_rms_mm"], "mm"), "3-D, RMS over all stations"),
-        ("tip error", _number(comparison["tip_error_mm"], "mm"), "3-D, RMS"),
-        ("twist error", _number(comparison["twist_rms_deg"], "°"), "RMS over all stations"),
-        ("within 95 % bounds", _number(comparison["shape_within_95_percent"], "%"), "of the position errors"),
+        ("marker error", number(comparison["marker_rms_mm"], "mm"), "3-D, RMS"),
+        ("shape error", number(comparison["shape_rms_mm"], "mm"), "3-D, RMS over all stations"),
+        ("tip error", number(comparison["tip_error_mm"], "mm"), "3-D, RMS"),
+        ("twist error", number(comparison["twist_rms_deg"], "°"), "RMS over all stations"),
+        ("within 95 % bounds", number(comparison["shape_within_95_percent"], "%"), "of the position errors"),
     ]
     compared = comparison["frames_compared"]
     outside = comparison["frames_outside_reference"]
-    text = f"Compared with {comparison['reference']}: {compared} sets; {outside} outside of the reference's time."
-    return f"<p class='sub'>{_text(text)}</p>{_cards(cards)}"
+    line = f"Compared with {comparison['reference']}: {compared} sets; {outside} outside of the reference's time."
+    return f"<p class='sub'>{text(line)}</p>{page.cards(cards)}"
 
 
 def _marker_table(comparison: Any) -> str:
@@ -261,14 +265,14 @@ def _marker_table(comparison: Any) -> str:
             one["side"],
             one["marker"],
             one["compared"],
-            _number(one["rms_mm"], ""),
-            *(_number(one["bias_mm"][axis], "", sign=True) for axis in "xyz"),
-            _number(one["spread_mm"], ""),
+            number(one["rms_mm"], ""),
+            *(number(one["bias_mm"][axis], "", sign=True) for axis in "xyz"),
+            number(one["spread_mm"], ""),
         )
         for one in comparison["markers"]
     ]
     columns = ("wing", "marker", "compared", "RMS, mm", "bias x", "bias y", "bias z, mm", "spread, mm")
-    return f"<details><summary>Error of every marker</summary>{_table(columns, rows)}</details>"
+    return f"<details><summary>Error of every marker</summary>{table(columns, rows)}</details>"
 
 
 def _ledger(result: Result) -> str:
@@ -277,106 +281,28 @@ def _ledger(result: Result) -> str:
     missing = result.summary["triggers_missing"]
     rows.append(("triggers without any set", "all", missing, result.summary["triggers"] + missing))
     for name, side in result.sides.items():
-        absent = result.summary["triggers"] - side.shape.trigger_index.size
+        sets = side.trigger_index.size
+        absent = result.summary["triggers"] - sets
         rows.append(("triggers without this wing's set", name, absent, result.summary["triggers"]))
-        total = side.markers.flags.size
-        for flag, count in _counted(side.markers.flags.ravel()):
-            rows.append((f"marker: {flag}", name, count, total))
-        for flag, count in _counted(side.shape.flags):
-            rows.append((f"set: {flag}", name, count, side.shape.flags.size))
-        for reason, count in Counter(reason for reason in side.reasons if reason).most_common():
-            rows.append((f"set not fitted: {reason}", name, count, side.shape.flags.size))
+        for flag, count in _most(side.health.flags):
+            rows.append((f"marker: {flag}", name, count, side.health.rows))
+        for kind, words in (("set", "flags"), ("set not fitted", "reason"), ("failing then", "gates_failing")):
+            for word, count in _most(side.words.get(words, {})):
+                rows.append((f"{kind}: {word}", name, count, sets))
     shown = [(what, name, count, total, f"{100 * count / total:.2f} %") for what, name, count, total in rows]  # type: ignore[operator]
-    return _table(("missing or flagged", "wing", "count", "of", "share"), shown)
+    return table(("missing or flagged", "wing", "count", "of", "share"), shown)
 
 
-def _counted(flags: Iterable[str]) -> list[tuple[str, int]]:
-    return Counter(flag for joined in flags if joined for flag in joined.split(",")).most_common()
+def _most(counts: Mapping[str, int]) -> list[tuple[str, int]]:
+    return Counter(counts).most_common()
 
 
 def _made_from(result: Result) -> str:
     timing = result.summary.get("timing_s", {})
     rows = [(f"{name}", f"{seconds:.1f} s") for name, seconds in timing.items()]
     inputs = [(name, digest) for name, digest in result.summary.get("inputs", {}).items()]
-    made = _text(f"wingshape {result.summary.get('version', '')}: {result.summary.get('command', '')}")
+    made = text(f"wingshape {result.summary.get('version', '')}: {result.summary.get('command', '')}")
     return (
         f"<section><h2>How it was made</h2><p class='mono'>{made}</p>"
-        f"{_table(('stage', 'time'), rows)}{_table(('input', 'SHA-256'), inputs)}</section>"
+        f"{table(('stage', 'time'), rows)}{table(('input', 'SHA-256'), inputs)}</section>"
     )
-
-
-def _cards(cards: Sequence[tuple[str, str, str]]) -> str:
-    inner = "".join(
-        f"<div><span>{_text(label)}</span><b>{_text(value)}</b><small>{_text(note)}</small></div>"
-        for label, value, note in cards
-    )
-    return f"<div class='cards'>{inner}</div>"
-
-
-def _table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    if not rows:
-        return ""
-    head = "".join(f"<th>{_text(column)}</th>" for column in columns)
-    body = "".join("<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _number(value: float | None, unit: str, *, sign: bool = False) -> str:
-    """Three figures and the unit; a dash for what is not known."""
-    if value is None:
-        return "–"
-    decimals = 1 if abs(value) >= 100 or unit == "%" else 2 if abs(value) >= 0.1 or sign else 3
-    space = "" if unit in ("", "°") else " "
-    return f"{round(value, decimals) + 0.0:{'+' if sign else ''}.{decimals}f}{space}{unit}"
-
-
-def _and(words: Sequence[str]) -> str:
-    return " and ".join(words)
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value))
-
-
-_STYLE = """
-:root { color-scheme: light; }
-body { margin: 0; background: #f6f7f8; color: #23272b;
-  font: 16px/1.55 "Iowan Old Style", "Palatino Linotype", Palatino, Georgia, "DejaVu Serif", serif; }
-main { max-width: 60rem; margin: 0 auto; padding: 2.5rem 2.5rem 4rem; background: #fff; box-shadow: 0 0 0 1px #e5e7ea; }
-h1 { font-size: 1.75rem; line-height: 1.2; margin: 0; font-weight: 600; }
-h2 { font-size: 1.2rem; margin: 2.8rem 0 .6rem; padding-top: .9rem; border-top: 1px solid #e0e3e6; font-weight: 600; }
-.sub { color: #667079; margin: .3rem 0 0; }
-.verdict { margin: 1.6rem 0; padding: .9rem 1.1rem; border-left: 5px solid; background: #f7f8f9; }
-.good { border-color: #3d7a4e; } .care { border-color: #c08a1e; } .poor { border-color: #a8362a; }
-.cards { display: flex; flex-wrap: wrap; gap: .8rem; margin: 1.2rem 0; }
-.cards div { flex: 1 1 9rem; border: 1px solid #e0e3e6; padding: .7rem .9rem; }
-.cards span, .cards small, table, figcaption, summary, .mono {
-  font-family: "Helvetica Neue", Arial, "DejaVu Sans", sans-serif; }
-.cards span { display: block; font-size: .78rem; color: #667079; }
-.cards b { display: block; font-size: 1.45rem; font-weight: 600; font-variant-numeric: tabular-nums; }
-.cards small { font-size: .74rem; color: #8a939b; }
-figure { margin: 1.4rem 0 2rem; } img { width: 100%; height: auto; display: block; }
-figcaption { font-size: .84rem; color: #56606a; margin-top: .4rem; max-width: 50rem; }
-table { border-collapse: collapse; width: 100%; font-size: .84rem; margin: 1rem 0;
-  font-variant-numeric: tabular-nums; }
-th { text-align: left; font-weight: 600; color: #56606a;
-  border-bottom: 1px solid #b9c0c6; padding: .3rem .6rem .3rem 0; }
-td { border-bottom: 1px solid #eceef0; padding: .28rem .6rem .28rem 0; overflow-wrap: anywhere; }
-summary { cursor: pointer; font-size: .9rem; }
-.mono { font-size: .8rem; overflow-wrap: anywhere; }
-@media print { body { background: #fff; } main { box-shadow: none; padding: 0; } figure { break-inside: avoid; } }
-"""
-
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body><main>
-{body}
-</main></body>
-</html>
-"""

@@ -13,12 +13,12 @@ FEWEST_SETS = 8  # for a correlation
 
 def has_signals(result: Result) -> bool:
     """Whether there is one to show."""
-    return bool(_shown(result))
+    return bool(shown_signals(result))
 
 
 def signals(result: Result) -> Figure:
     """The tip's height in time, and below it the signals that go with it most, at the same instants."""
-    shown = _shown(result)
+    shown = shown_signals(result)
     figure, axes = panels(1 + len(shown), 1, 1.6 + 1.25 * len(shown))
     for name, side in result.sides.items():
         curve(axes[0], seconds(result, side), 1e3 * side.frames["tip_dz_m"], name)
@@ -32,7 +32,7 @@ def signals(result: Result) -> Figure:
     return figure
 
 
-def _shown(result: Result) -> list[tuple[str, float]]:
+def shown_signals(result: Result) -> list[tuple[str, float]]:
     """Signals that vary, and their correlation with the tip's height over both wings; the strongest first."""
     names = {name: None for side in result.sides.values() for name in side.signals}
     found = []

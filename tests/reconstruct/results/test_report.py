@@ -1,5 +1,8 @@
 """The report: every figure is in it, nothing is fetched from elsewhere, and its words agree with its numbers."""
 
+import base64
+import hashlib
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -14,10 +17,14 @@ from capture.errors import ReconstructError, UsageError
 from process.signal_table import sets_of, signal_table, signals_path
 from process.signals import Signal, Signals
 from reconstruct import figures
+from reconstruct.page import asset
 from reconstruct.report import COMPARED_PLATES, PLATES, Plate, write_report
 from reconstruct.result import read_result
 from reconstruct.run import Job, run_comparison, run_job
+from reconstruct.shown import DETAIL_S, FRAMES_SHOWN, Heights, choose, highest_ns
 from reconstruct.summary import verdict
+
+START_NS = 1_700_000_000_000_000_000
 
 
 class Page(HTMLParser):
@@ -35,7 +42,7 @@ class Page(HTMLParser):
         self.sources += [found[name] or "" for name in ("src", "href", "data", "poster") if name in found]
         if tag == "figure":
             self.figures.append(found["id"] or "")
-        if tag not in ("meta", "img"):
+        if tag not in ("meta", "img", "input"):
             self.open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
@@ -62,8 +69,13 @@ def result(bending_wing: Any, wing_file: Path, tmp_path_factory: pytest.TempPath
 
 
 def names(*plates: Plate) -> list[str]:
-    """The figures of a short flight."""
-    return sorted(plate.name for plate in plates if plate.name != "tip-whole")
+    """The figures of a short flight, and the view."""
+    return sorted(["wing-view", *(plate.name for plate in plates if plate.name not in ("tip-whole", "spectrum"))])
+
+
+def without_data(text: str) -> str:
+    """The page without what is encoded, and without its program."""
+    return re.sub(r"base64,[^\"]*|<script.*?</script>", "", text, flags=re.DOTALL)
 
 
 def test_every_figure_is_embedded_and_nothing_is_external(result: Path) -> None:
@@ -71,12 +83,63 @@ def test_every_figure_is_embedded_and_nothing_is_external(result: Path) -> None:
     page = Page(text)
     assert page.open == []
     assert sorted(page.figures) == names(*PLATES, *COMPARED_PLATES)
-    assert len(page.sources) == len(page.figures)
+    assert len(page.sources) == len(page.figures) - 1
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
-    assert not re.search(r"(https?:)?//[a-z]|@import|url\(|<script|<link|<iframe", re.sub(r"base64,[^\"]*", "", text))
+    assert not re.search(r"(https?:)?//[a-z]|@import|url\(|<link|<iframe", without_data(text))
+    assert not re.search(r"https?:|import|fetch|XMLHttpRequest|eval", asset("wing_view.js"))
     for name in names(*PLATES, *COMPARED_PLATES):
-        assert (result / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert name == "wing-view" or (result / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert "truth &lt;&amp;&gt;" in text  # names of files are text, not tags
+
+
+def test_the_policy_names_style_and_program_and_nothing_else(result: Path) -> None:
+    text = (result / "report.html").read_text(encoding="utf-8")
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)
+    assert policy
+    for kind, tag in (("style-src", "style"), ("script-src", "script")):
+        content = re.search(rf"<{tag}>(.*?)</{tag}>", text, flags=re.DOTALL)
+        assert content
+        digest = base64.b64encode(hashlib.sha256(content[1].encode()).digest()).decode()
+        assert f"{kind} 'sha256-{digest}'" in policy[1]
+    assert "default-src 'none'" in policy[1]
+    assert "unsafe" not in policy[1]
+    assert " style=" not in without_data(text)
+
+
+def test_the_view_holds_the_result(result: Path) -> None:
+    """Decoded by hand: the strip's middle follows the fitted axis, markers are where they were measured."""
+    text = (result / "report.html").read_text(encoding="utf-8")
+    found = re.search(r'id="wing-data">(.*?)</script>', text, flags=re.DOTALL)
+    assert found
+    data = json.loads(found[1])
+    (track,) = data["tracks"]
+    shape, markers = pq.read_table(result / "shape.parquet"), pq.read_table(result / "markers.parquet")
+    for side in ("left", "right"):
+        own = track["sides"][side]
+        edges = whole(own["edges"]).reshape(12, -1, 2, 3) * data["step_m"]
+        mine = shape.filter(np.asarray(shape.column("side")) == side)
+        axis = np.stack([mine.column(f"{x}_m").to_numpy() for x in "xyz"], axis=-1).reshape(12, -1, 3)
+        width = np.linalg.norm(edges[:, :, 0] - edges[:, :, 1], axis=-1)
+        fitted = np.isfinite(axis[:, 0, 0])
+        assert np.array_equal(np.isfinite(edges[:, 0, 0, 0]), fitted)
+        assert width[fitted] == pytest.approx(0.14, abs=0.002)  # CHORD_M of the wing, from markers of 1 mm noise
+        fore = edges[:, :, 0] + (edges[:, :, 1] - edges[:, :, 0]) * 0.04 / 0.14
+        assert np.abs(fore - axis)[fitted].max() < 0.002
+        seen = markers.filter(np.asarray(markers.column("side")) == side)
+        xyz = np.stack([seen.column(f"{x}_m").to_numpy() for x in "xyz"], axis=-1).reshape(12, 18, 3)
+        xyz[np.isnan(xyz).any(axis=-1)] = np.nan
+        drawn = whole(own["markers"]).reshape(12, 18, 3) * data["step_m"]
+        np.testing.assert_allclose(drawn, xyz, atol=data["step_m"])
+        tip_mm = np.frombuffer(base64.b64decode(own["tip_mm"]), "<f4")
+        frames = pq.read_table(result / "frames.parquet", filters=[("side", "=", side)])
+        np.testing.assert_allclose(tip_mm, 1e3 * frames.column("tip_dz_m").to_numpy(), rtol=1e-6)
+    assert "load_factor" in track["signals"]
+
+
+def whole(text: str) -> np.ndarray:
+    """Numbers of 16 bits, NaN where unknown."""
+    numbers = np.frombuffer(base64.b64decode(text), "<i2").astype(float)
+    return np.where(numbers == -32768, np.nan, numbers)
 
 
 def test_words_and_ledger_tell_what_is_missing(result: Path) -> None:
@@ -92,19 +155,45 @@ def test_words_and_ledger_tell_what_is_missing(result: Path) -> None:
 def test_without_a_comparison(result: Path, tmp_path: Path) -> None:
     page = write_report(read_result(result), tmp_path).read_text(encoding="utf-8")
     assert sorted(Page(page).figures) == names(*PLATES)
-    assert "reference" not in re.sub(r"base64,[^\"]*|reference axis", "", page)
+    assert "reference" not in re.sub("reference axis", "", without_data(page))
 
 
-def test_chosen_instants_are_the_extremes(result: Path) -> None:
-    read = read_result(result)
-    first = read.sides["right"]
-    row = {int(trigger): at for at, trigger in enumerate(first.shape.trigger_index)}
-    lift = first.frames["tip_dz_m"]
-    chosen = figures.chosen_sets(read)
-    assert list(chosen) == ["lowest", "middle", "highest"]
-    assert lift[row[chosen["lowest"]["right"]]] == lift.min()
-    assert lift[row[chosen["highest"]["right"]]] == lift.max()
-    assert all(np.isfinite(read.sides["left"].frames["tip_dz_m"][names["left"]]) for names in chosen.values())
+def heights(sets: int) -> dict[str, Heights]:
+    """The right wing was fitted in all but the first set and oscillates at 1 Hz; the left one lacks every tenth set."""
+    trigger = np.arange(100, 100 + sets)
+    time_ns = START_NS + np.arange(sets) * 40_000_000
+    dz = np.sin(2 * np.pi * np.arange(sets) * 0.04) * np.linspace(0.5, 1.0, sets)
+    dz[0] = np.nan
+    kept = np.arange(sets) % 10 != 3
+    return {"left": Heights(trigger[kept], time_ns[kept], -dz[kept]), "right": Heights(trigger, time_ns, dz)}
+
+
+def test_instants_shown_are_the_extremes() -> None:
+    sides = heights(100)
+    dz = sides["right"].tip_dz_m
+    found = choose(sides)
+    assert list(found.instants) == ["lowest", "middle", "highest"]
+    assert dz[found.instants["lowest"]["right"] - 100] == np.nanmin(dz)
+    assert dz[found.instants["highest"]["right"] - 100] == np.nanmax(dz)
+    for chosen in found.instants.values():
+        assert chosen["left"] in sides["left"].trigger_index
+        assert abs(chosen["left"] - chosen["right"]) <= 1
+    assert len(found.tracks) == 1
+    np.testing.assert_array_equal(found.tracks[0].trigger_index, sides["right"].trigger_index)
+
+
+@pytest.mark.parametrize("sets", [501, 1000, 30_000, 100_001])
+def test_what_is_shown_of_a_long_flight_is_bounded(sets: int) -> None:
+    sides = heights(sets)
+    whole_flight, detail = choose(sides).tracks if sets > 501 else (*choose(sides).tracks, None)
+    assert whole_flight.trigger_index.size <= FRAMES_SHOWN
+    assert whole_flight.timestamp_ns[0] == START_NS
+    if detail is None:  # just 20 s
+        return
+    assert detail.trigger_index.size == 501
+    assert np.ptp(detail.timestamp_ns) == 20_000_000_000
+    assert highest_ns(sides) in detail.timestamp_ns
+    assert choose(sides).triggers("left").size <= 2 * FRAMES_SHOWN + 3
 
 
 def test_a_long_flight_is_drawn_as_range_and_in_detail(result: Path) -> None:
@@ -114,18 +203,42 @@ def test_a_long_flight_is_drawn_as_range_and_in_detail(result: Path) -> None:
     sides = {}
     for name, side in short.sides.items():
         time = short.start_ns + np.arange(sets) * 40_000_000
-        shape = replace(side.shape, trigger_index=np.arange(sets), timestamp_ns=time, flags=side.shape.flags[row])
-        sides[name] = replace(side, shape=shape, frames={key: value[row] for key, value in side.frames.items()})
+        frames = {key: value[row] for key, value in side.frames.items()}
+        sides[name] = replace(side, trigger_index=np.arange(sets), timestamp_ns=time, frames=frames)
     long = replace(short, sides=sides)
     assert figures.is_long(long)
     assert not figures.is_long(short)
-    detail, whole = figures.tip(long).axes[0], figures.tip_whole(long).axes[0]
+    detail, all_of_it = figures.tip(long).axes[0], figures.tip_whole(long).axes[0]
     shown = np.asarray(detail.lines[0].get_xdata())
     highest = np.nanargmax(sides["right"].frames["tip_dz_m"]) * 0.04
-    assert np.ptp(shown) <= figures.DETAIL_S
+    assert np.ptp(shown) <= DETAIL_S
     assert shown.min() <= highest <= shown.max()
-    assert len(np.asarray(whole.lines[0].get_xdata())) <= figures.DRAWN_SETS
-    assert np.nanmax(np.asarray(whole.lines[0].get_xdata())) > 40.0
+    assert len(np.asarray(all_of_it.lines[0].get_xdata())) <= figures.DRAWN_SETS
+    assert np.nanmax(np.asarray(all_of_it.lines[0].get_xdata())) > 40.0
+
+
+def test_sums_over_the_flight_are_those_of_the_tables(result: Path) -> None:
+    """By pandas, from the whole tables at once."""
+    markers, residuals, shape, errors = (
+        pq.read_table(result / f"{name}.parquet").to_pandas()
+        for name in ("markers", "residuals", "shape", "shape_errors")
+    )
+    found = read_result(result, result / "comparison.json")
+    for name, side in found.sides.items():
+        mine = markers[markers.side == name]
+        np.testing.assert_allclose(side.health.seen_percent, 100 * mine.x_m.notna().groupby(mine.marker).mean())
+        assert side.health.flags.get("not_seen", 0) == (mine["flags"] == "not_seen").sum()
+        assert np.nansum(side.health.seen_in_time_percent) > 0
+        own = residuals[(residuals.side == name) & residuals.used]
+        square = own.residual_x_m**2 + own.residual_y_m**2 + own.residual_z_m**2
+        np.testing.assert_allclose(side.residuals.rms_m, np.sqrt(square.groupby(own.marker).mean()))
+        wing = shape[shape.side == name]
+        np.testing.assert_array_equal(side.z_range_m[1], wing.groupby("station").z_m.max())
+        np.testing.assert_array_equal(side.twist_range_deg[0], wing.groupby("station").twist_deg.min())
+        error = errors[errors.side == name]
+        square = error.error_x_m**2 + error.error_y_m**2 + error.error_z_m**2
+        np.testing.assert_allclose(found.errors[name].along_rms_m, np.sqrt(square.groupby(error.station).mean()))
+        np.testing.assert_allclose(found.errors[name].shape_rms_m, np.sqrt(square.groupby(error.trigger_index).mean()))
 
 
 @pytest.mark.slow
