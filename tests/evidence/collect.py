@@ -93,6 +93,10 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
             "python tests/evidence/reconstruct_speed.py {target}",
         ),
         Step(
+            "95 % bands over 500 short flights, each with a calibration of its own",
+            "python tests/evidence/flight_coverage.py {target}",
+        ),
+        Step(
             "killed and resumed, one process or several or Dask: the same",
             "pytest -q tests/end_to_end/test_reconstruct_a_flight.py",
         ),

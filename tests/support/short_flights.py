@@ -31,6 +31,8 @@ from reconstruct.wing import example_path, read_wing
 SETS, APART = 4, 100  # sets at either time, and triggers between the two: half a period of the slow motion
 SLOW_HZ = 0.125
 HEIGHT_M, HEIGHT_SIGMA_M = 0.004, 0.0005  # of the lights above the axis, as the wing file says
+INSIDE_95 = 7.815  # of χ² with three degrees of freedom
+WITHIN_95 = 1.959964  # sigmas of a normal error
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Drawn:
     twist: float
     """error over sigma of its twist there"""
     twist_squares: float
+    twist_error_deg: float
+    twist_sigma_deg: float
 
 
 def fly(seed: int) -> Drawn:
@@ -91,6 +95,8 @@ def fly(seed: int) -> Drawn:
         1e3 * float(np.linalg.norm(sigma[station, :3])),
         float(scores[station, 3]),
         float(np.mean(scores[:, 3] ** 2)),
+        math.degrees(abs(off[station, 3])),
+        math.degrees(sigma[station, 3]),
     )
 
 
