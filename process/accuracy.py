@@ -132,7 +132,7 @@ def _at_cam0(pair: StereoPair) -> RigSide:
 def _corners(paths: list[Path], finders: tuple[str, str]) -> list[Array]:
     found = []
     for path, finder in zip(paths, finders, strict=True):
-        view = find_corners(path, read_grey(path), BOARD)
+        view = find_corners(path, read_grey(path), BOARD, (finder,))
         if finder not in view.corners:
             raise ProcessError(f"{path}: the target is not found ({view.reason or finder}); take this distance out")
         found.append(view.corners[finder])

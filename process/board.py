@@ -1,6 +1,7 @@
 """One checkerboard image to the sub-pixel places of the board's inner corners, in a fixed order."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -110,15 +111,15 @@ def _is_whole(data: bytes) -> bool:
     return True
 
 
-def find_corners(path: Path, image: Image, board: Board) -> View:
-    """Corners of the one board in ``image``, by each of the ways in ``FINDERS``.
+def find_corners(path: Path, image: Image, board: Board, finders: Sequence[str] = FINDERS) -> View:
+    """Corners of the one board in ``image``, by each of the ways in ``finders``, of ``FINDERS``.
 
     ``subpix`` is the plain finder with cornerSubPix, ``sb`` the sector-based finder, and ``edges`` fits blurred
     edges to the grey values around each corner. No one of them is best on every board: the caller chooses by the
     residuals of a calibration.
     """
     coarse = _find_plain(image, board)
-    sector_based = _find_sector_based(image, board, coarse)
+    sector_based = _find_sector_based(image, board, coarse) if coarse is None or "sb" in finders else None
     start = coarse if coarse is not None else sector_based
     if start is None:
         return View(path, {}, f"no board of {board.columns}x{board.rows} inner corners found")
@@ -127,11 +128,12 @@ def find_corners(path: Path, image: Image, board: Board) -> View:
     if reason:
         return View(path, {}, reason)
     radius = refinement_radius_px(start, board)
-    found = {
-        "edges": refine_edges(image, start, edge_directions_rad(start, board), radius),
-        "subpix": _refine_subpix(image, start, radius),
-    }
-    if sector_based is not None:
+    found = {}
+    if "edges" in finders:
+        found["edges"] = refine_edges(image, start, edge_directions_rad(start, board), radius)
+    if "subpix" in finders:
+        found["subpix"] = _refine_subpix(image, start, radius)
+    if "sb" in finders and sector_based is not None:
         found["sb"] = in_board_order(image, sector_based, board)
     limit = 0.25 * corner_spacing_px(start, board)
     good = {

@@ -17,10 +17,16 @@ from capture.console import note, say, say_json
 from capture.errors import ProcessError, UsageError
 from process.board import Board
 from process.calibrate import Calibration, CalibrationSettings, Method, calibration_covariance_m2
-from process.calibration_quality import RANGES_M, Quality, judge
+from process.calibration_quality import Quality, judge, working_ranges_m
 from process.calibration_recording import find_in_recording
 from process.calibration_report import write_report
-from process.calibration_session import SessionCalibration, calibrate_session, find_session, image_pairs
+from process.calibration_session import (
+    SessionCalibration,
+    calibrate_session,
+    find_session,
+    finders_of,
+    image_pairs,
+)
 from process.camera_model import write_pair
 from process.charuco import dictionary
 from process.cross_validation import FOLDS
@@ -79,7 +85,7 @@ def calibrate(
             raise ProcessError(f"{path.parent}: no such folder to write to; make it first")
     with _progress() as progress:
         if isinstance(source, list):
-            session = find_session(source, target, workers, progress)
+            session = find_session(source, target, workers, progress, finders_of(method))
         else:
             session = find_in_recording(*source, target, workers, progress)
     settings = CalibrationSettings(method, nominal_board, distortion_terms, flatness_mm / 1000.0)
@@ -227,11 +233,12 @@ def _predicted_sigma_mm(result: SessionCalibration) -> list[dict[str, Any]]:
     pair = result.calibration.pair
     if pair.covariance is None:
         return []
-    points = np.array([[0.5 * pair.baseline_m, 0.0, z] for z in RANGES_M])
+    ranges_m = working_ranges_m(result.calibration)
+    points = np.array([pair.middle_of_view(range_m) for range_m in ranges_m])
     sigma_mm = 1000.0 * np.sqrt(np.diagonal(calibration_covariance_m2(pair, points), axis1=1, axis2=2))
     return [
-        {"range_m": z, "sigma_xyz_mm": [finite_or_none(value) for value in sigma]}
-        for z, sigma in zip(RANGES_M, sigma_mm, strict=True)
+        {"range_m": range_m, "sigma_xyz_mm": [finite_or_none(value) for value in sigma]}
+        for range_m, sigma in zip(ranges_m, sigma_mm, strict=True)
     ]
 
 

@@ -6,12 +6,12 @@ from matplotlib.figure import Figure
 
 from process.board import Board
 from process.bundle import rms_px
-from process.calibration_quality import CELLS, Quality, uncertainty_map
+from process.calibration_quality import CELLS, Quality, uncertainty_map, working_ranges_m
 from process.calibration_session import SessionCalibration
 from process.camera_model import StereoPair
 
 BLUE, ORANGE = "#1f4e79", "#c55a11"
-NEAREST_M, FARTHEST_M = 0.5, 4.0
+NEAREST, FARTHEST = 1 / 2, 4 / 3  # of the nearest and the farthest distance that figures are given for
 
 
 def residuals(result: SessionCalibration) -> Figure:
@@ -67,7 +67,8 @@ def uncertainty_over_image(result: SessionCalibration, quality: Quality) -> Figu
     """Sigma of a point by its place in cam0's image."""
     figure = Figure(figsize=(11, 3.2), layout="constrained")
     pair = result.calibration.pair
-    for axes, each in zip(figure.subplots(1, len(quality.uncertainty)), quality.uncertainty, strict=True):
+    plots = figure.subplots(1, len(quality.uncertainty), squeeze=False)[0]
+    for axes, each in zip(plots, quality.uncertainty, strict=True):
         shown = axes.imshow(each.sigma_mm, extent=_extent(pair), cmap="viridis", vmin=0.0, interpolation="none")
         axes.set(
             title=f"{each.range_m:g} m: {each.median_mm:.2f} mm, worst {each.worst_mm:.2f} mm", xticks=[], yticks=[]
@@ -80,8 +81,9 @@ def uncertainty_over_range(result: SessionCalibration) -> Figure:
     """Median and worst sigma of a point by its distance."""
     figure = Figure(figsize=(7, 3.5), layout="constrained")
     axes = figure.subplots()
-    maps = [uncertainty_map(result.calibration.pair, float(z)) for z in np.linspace(NEAREST_M, FARTHEST_M, 15)]
-    ranges_m = [each.range_m for each in maps]
+    given_m = working_ranges_m(result.calibration)
+    ranges_m = np.linspace(NEAREST * given_m[0], FARTHEST * given_m[-1], 15)
+    maps = [uncertainty_map(result.calibration.pair, float(range_m)) for range_m in ranges_m]
     axes.plot(ranges_m, [each.worst_mm for each in maps], "--", color=ORANGE, label="worst place")
     axes.plot(ranges_m, [each.median_mm for each in maps], color=BLUE, label="median")
     axes.set(xlabel="distance, m", ylabel="sigma, mm", ylim=(0.0, None))

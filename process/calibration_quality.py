@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 CELLS = (9, 12)  # rows and columns: whole parts of the 3 × 3 regions that are named
 RANGES_M = (1.0, 2.0, 3.0)
+LEAST_COMMON = 0.25  # of cam0's image, that the other camera sees too: with less the pair is not for that distance
 EMPTY_SHARE = 0.5  # of a region's cells without a corner, from which on it is called empty
 PATTERN_ALARM = 0.4  # of the residuals' pattern by the corners' noise
 
@@ -31,7 +32,7 @@ class ImageMap:
     corners: NDArray[np.intp]
     """(rows, columns) corners measured in the cell, over all views"""
     common: NDArray[np.bool_]
-    """(rows, columns) whether the other camera sees the cell too, at the farthest of ``RANGES_M``"""
+    """(rows, columns) whether the other camera sees the cell too, at the farthest range that figures are given for"""
     mean_px: Array
     """(rows, columns, 2) mean residual, projected minus measured; NaN without corners"""
     pattern_px: float
@@ -76,7 +77,7 @@ class Quality:
 
     images: tuple[ImageMap, ImageMap]
     uncertainty: list[UncertaintyMap]
-    """at each of ``RANGES_M``; empty with method ``paper``"""
+    """at each of ``working_ranges_m``; empty with method ``paper``"""
     cross_validation: CrossValidation | None
     next_view: NextView | None
 
@@ -114,15 +115,30 @@ def judge(calibration: Calibration, corners_px: Array, board: Board, folds: int)
     """Figures of merit of a calibration from ``corners_px`` (2, V, N, 2) of the views used; ``folds`` 0: no
     cross-validation."""
     first, second = (image_map(calibration, corners_px, camera) for camera in (0, 1))
-    uncertainty = [uncertainty_map(calibration.pair, range_m) for range_m in RANGES_M]
+    ranges_m = working_ranges_m(calibration)
+    uncertainty = [uncertainty_map(calibration.pair, range_m) for range_m in ranges_m]
     known = calibration.pair.covariance is not None
-    points = np.concatenate([common_points(calibration.pair, range_m) for range_m in RANGES_M])
+    points = np.concatenate([common_points(calibration.pair, range_m) for range_m in ranges_m])
     return Quality(
         (first, second),
         uncertainty if known else [],
         cross_validate(calibration, corners_px, folds) if folds else None,
         advise(calibration, board, points[np.isfinite(points).all(axis=1)]),
     )
+
+
+def working_ranges_m(calibration: Calibration) -> tuple[float, ...]:
+    """Distances that figures are given for: those of ``RANGES_M`` at which the cameras see enough in common.
+
+    Those of a pair that is turned in part again: if they do before the farthest of ``RANGES_M``, it is meant for where
+    the board was, and the figures are for its nearest, median and farthest place.
+    """
+    pair = calibration.pair
+    usual = tuple(range_m for range_m in RANGES_M if np.mean(_common(pair, 0, range_m)) >= LEAST_COMMON)
+    if usual[-1:] == RANGES_M[-1:]:
+        return usual
+    board_m = np.percentile(calibration.estimate.views[:, 5], [0.0, 50.0, 100.0])
+    return tuple(sorted({float(f"{range_m:.2g}") for range_m in board_m}))
 
 
 def image_map(calibration: Calibration, corners_px: Array, camera: int) -> ImageMap:
@@ -138,7 +154,7 @@ def image_map(calibration: Calibration, corners_px: Array, camera: int) -> Image
     sums = np.stack([np.bincount(cell, residuals[:, axis], rows * columns) for axis in (0, 1)], axis=1)
     mean = sums / np.where(count, count, np.nan)[:, None]
     corners = count.reshape(CELLS)
-    common = _common(calibration.pair, camera)
+    common = _common(calibration.pair, camera, working_ranges_m(calibration)[-1])
     return ImageMap(
         corners,
         common,
@@ -181,7 +197,7 @@ def common_points(pair: StereoPair, range_m: float) -> Array:
     return points
 
 
-def _common(pair: StereoPair, camera: int, range_m: float = RANGES_M[-1]) -> NDArray[np.bool_]:
+def _common(pair: StereoPair, camera: int, range_m: float) -> NDArray[np.bool_]:
     """(rows, columns) whether the other camera sees the middle of the cell at ``range_m``."""
     own, other = (pair.cam0, pair.cam1)[:: 1 - 2 * camera]
     T = pair.T_cam1_cam0 if camera == 0 else np.linalg.inv(pair.T_cam1_cam0)

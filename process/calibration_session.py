@@ -18,6 +18,7 @@ from process.calibrate import (
     MIN_VIEWS_FOR_PRINT,
     Calibration,
     CalibrationSettings,
+    Method,
     calibrate,
     check_poses_differ,
     start_alone,
@@ -115,9 +116,13 @@ def find_session(
     board: Board,
     workers: int = WORKERS,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    finders: Sequence[str] = FINDERS,
 ) -> Session:
-    """Find the board in all images. ProcessError for a file that cannot be used, or of another size than the first."""
-    jobs = [(path, board) for pair in pairs for path in pair]
+    """Find the board in all images, its corners by each of ``finders``.
+
+    ProcessError for a file that cannot be used, or of another size than the first.
+    """
+    jobs = [(path, board, tuple(finders)) for pair in pairs for path in pair]
     found: list[tuple[View, tuple[int, int]]] = []
     for done, result in enumerate(in_order(_find_one, jobs, workers), 1):
         found.append(result)
@@ -133,17 +138,22 @@ def find_session(
     return Session(board, (width, height), list(zip(views[0::2], views[1::2], strict=True)))
 
 
-def _find_one(job: tuple[Path, Board]) -> tuple[View, tuple[int, int]]:
-    path, board = job
+def _find_one(job: tuple[Path, Board, tuple[str, ...]]) -> tuple[View, tuple[int, int]]:
+    path, board, finders = job
     image = read_grey(path)
     refuse_blank(path, image)
     cv2.setNumThreads(1)
-    return find_board(path, image, board), (image.shape[1], image.shape[0])
+    return find_board(path, image, board, finders), (image.shape[1], image.shape[0])
 
 
-def find_board(path: Path, image: Image, board: Board) -> View:
+def find_board(path: Path, image: Image, board: Board, finders: Sequence[str] = FINDERS) -> View:
     """Corners of the board in ``image``, a plain one or a ChArUco one."""
-    return find_corners(path, image, board) if board.charuco is None else find_charuco(path, image, board)
+    return find_corners(path, image, board, finders) if board.charuco is None else find_charuco(path, image, board)
+
+
+def finders_of(method: Method) -> tuple[str, ...]:
+    """The ways to measure corners that a calibration chooses from: the paper's has cornerSubPix alone."""
+    return ("subpix",) if method is Method.paper else FINDERS
 
 
 def calibrate_session(session: Session, settings: CalibrationSettings) -> SessionCalibration:
@@ -191,7 +201,7 @@ def _choose_finder(
     views: Sequence[View], session: Session, settings: CalibrationSettings
 ) -> tuple[Array, str, dict[str, float]]:
     """Corners (V, N, 2) by the finder with the smallest residual of this camera alone, where all finders succeeded."""
-    finders = FINDERS if session.board.charuco is None else ("edges", "subpix")
+    finders = [name for name in finders_of(settings.method) if any(name in view.corners for view in views)]
     complete = [view for view in views if all(name in view.corners for name in finders)]
     rms: dict[str, float] = {}
     board_moves = not settings.nominal_board and len(complete) >= MIN_VIEWS_FOR_PRINT
@@ -202,7 +212,8 @@ def _choose_finder(
             start, _ = start_alone(corners, session.board, session.size_px, settings.distortion_terms)
             freedom = Freedom(distortion_terms=settings.distortion_terms, board=board_moves)
             rms[name] = adjust(corners[None], start, freedom).rms_px
-    order = sorted(finders, key=lambda name: rms.get(name, np.inf))  # stable: without residuals, FINDERS' order
+    # stable: without residuals, FINDERS' order
+    order = sorted(FINDERS, key=lambda name: (name not in finders, rms.get(name, np.inf)))
     corners = np.stack([next(view.corners[name] for name in order if name in view.corners) for view in views])
     return corners, order[0], rms
 

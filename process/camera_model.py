@@ -172,6 +172,22 @@ class StereoPair:
         rotation = cv2.Rodrigues(self.T_cam1_cam0[:3, :3])[0].reshape(3)
         return np.concatenate([self.cam0.intrinsics, self.cam1.intrinsics, rotation, self.T_cam1_cam0[:3, 3]])
 
+    @property
+    def middle_axes(self) -> Array:
+        """(3, 3) axes half way between cam0's and cam1's, in cam0's frame: of a board that faces the pair."""
+        return pose_matrix(-0.5 * self.parameters[18:21], np.zeros(3))[:3, :3]
+
+    def middle_of_view(self, depth_m: float) -> Array:
+        """(3,) cam0's frame: half way between where the rays of both images' middles are at ``depth_m``."""
+        R, t = self.T_cam1_cam0[:3, :3], self.T_cam1_cam0[:3, 3]
+        ray0, ray1 = (
+            np.append(own.undistort([(own.width - 1) / 2, (own.height - 1) / 2])[0], 1.0)
+            for own in (self.cam0, self.cam1)
+        )
+        centre1, ray1 = -R.T @ t, R.T @ ray1
+        at_depth1 = centre1 + ray1 * (depth_m - centre1[2]) / ray1[2]
+        return np.asarray(0.5 * (ray0 * depth_m + at_depth1))
+
     def with_parameters(self, parameters: ArrayLike) -> "StereoPair":
         """The pair with other values of ``parameters``: what the propagation of its covariance needs."""
         values = np.asarray(parameters, np.float64)

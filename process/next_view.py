@@ -1,20 +1,22 @@
 """A calibration to the view of the board that would improve it most.
 
 A grid of poses is tried: the board at several distances, in the middle of what both cameras see and as far to each side
-as it fits, facing the pair and turned each way. A view adds information (Fisher's, ``bundle.view_information``) that
-does not depend on what is measured in it: the covariance with it is known before it is taken.
+as it fits, facing the pair (half way between its axes: they may be turned in) and turned each way. A view adds
+information (Fisher's, ``bundle.view_information``) that does not depend on what is measured in it: the covariance with
+it is known before it is taken.
 """
 
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve
 
 from process.board import Board
-from process.bundle import prior_information, view_information
+from process.bundle import prior_information, rotation_matrix, view_information
 from process.calibrate import Calibration, Method, print_scale_covariance
 from process.camera_model import StereoPair, pose_matrix
 from process.shared_error import triangulated_by_calibration
@@ -44,7 +46,7 @@ class NextView:
     """(4, 4) metres"""
     range_m: float
     tilt_deg: tuple[float, float]
-    """about the image's horizontal and vertical"""
+    """about the horizontal and the vertical of the pair's middle, from facing it"""
     place: str
     """part of the image"""
     text: str
@@ -78,7 +80,8 @@ def advise(calibration: Calibration, board: Board, points_cam0: Array) -> NextVi
     scored = [(worst.sigma_mm(pose), pose, words) for pose, words in candidates]
     then_mm, pose, (range_m, place, tilt) = min(scored, key=lambda each: each[0])
     turned = TILTS[tilt].format(TILT_DEG)
-    text = f"hold the board at {range_m:.1f} m in the {place} of the left camera's image, {turned}"
+    at_m = f"{range_m:.1f}" if range_m >= 1.0 else f"{range_m:.2f}"
+    text = f"hold the board at {at_m} m in the {place} of the left camera's image, {turned}"
     T_cam0_board = pose_matrix(pose[:3], pose[3:])
     return NextView(T_cam0_board, range_m, (TILT_DEG * tilt[0], TILT_DEG * tilt[1]), place, text, now_mm, then_mm)
 
@@ -128,8 +131,9 @@ def _candidates(pair: StereoPair, board: Board) -> list[tuple[Array, tuple[float
         if share * pair.cam0.width / (board.columns - 1) < LEAST_SPACING_PX:
             continue
         for tilt, (down, right) in product(TILTS, product(VERTICAL, HORIZONTAL)):
-            turn = np.radians(TILT_DEG) * np.array([*tilt, 0.0])
-            turned = corners @ pose_matrix(turn, np.zeros(3))[:3, :3].T
+            tilted = pose_matrix(np.radians(TILT_DEG) * np.array([*tilt, 0.0]), np.zeros(3))[:3, :3]
+            turn = cv2.Rodrigues(pair.middle_axes @ tilted)[0].ravel()
+            turned = corners @ rotation_matrix(turn).T
             place = _farthest(pair, turned, range_m, np.array([right, down], np.float64))
             if place is not None:
                 words = (range_m, _place_name(pair, place), tilt)
@@ -140,9 +144,7 @@ def _candidates(pair: StereoPair, board: Board) -> list[tuple[Array, tuple[float
 def _farthest(pair: StereoPair, turned: Array, range_m: float, direction: Array) -> Array | None:
     """Centre (3,) of a board ``turned``, moved in ``direction`` as far as both cameras see it whole; None: nowhere."""
     R, t = pair.T_cam1_cam0[:3, :3], pair.T_cam1_cam0[:3, 3]
-    middle0 = (np.array([pair.cam0.width, pair.cam0.height]) - 1.0) / 2.0
-    axis = np.append(pair.cam0.undistort(middle0)[0], 1.0) * range_m
-    start = axis + np.array([0.5 * pair.baseline_m, 0.0, 0.0])
+    start = pair.middle_of_view(range_m)
     reach = 0.5 * np.array([pair.cam0.width, pair.cam0.height]) / np.diag(pair.cam0.K)[:2] * range_m
 
     def fits(centre: Array) -> bool:
