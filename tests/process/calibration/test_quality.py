@@ -7,7 +7,14 @@ import pytest
 from process.board import Board
 from process.bundle import prior_information, view_information
 from process.calibrate import CalibrationSettings, Method, calibrate
-from process.calibration_quality import RANGES_M, common_points, image_map, judge, uncertainty_map
+from process.calibration_quality import (
+    RANGES_M,
+    common_points,
+    image_map,
+    judge,
+    uncertainty_map,
+    working_ranges_m,
+)
 from process.camera_model import CameraModel, StereoPair, pose_matrix
 from process.cross_validation import cross_validate
 from process.next_view import SHARES, TILTS, advise
@@ -34,17 +41,17 @@ def poses(count, seed, right=(-0.15, 0.15)):
     return found
 
 
-def see(board_poses, seed, height_m=0.0, print_m=5e-5):
+def see(board_poses, seed, height_m=0.0, print_m=5e-5, pair=PAIR, board=BOARD):
     """Corners (2, V, N, 2), printed with errors, by OpenCV's own projection."""
     rng = np.random.default_rng(seed)
-    flat = BOARD.points_m + np.random.default_rng(3).normal(0.0, print_m, BOARD.points_m.shape)
+    flat = board.points_m + np.random.default_rng(3).normal(0.0, print_m, board.points_m.shape)
     corners = np.column_stack([flat, np.zeros(len(flat)) + height_m])
     pixels = [
         [
             cv2.projectPoints(corners, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], own.K, own.distortion)[0].reshape(-1, 2)
             for T in (from_cam0 @ pose for pose in board_poses)
         ]
-        for own, from_cam0 in ((PAIR.cam0, np.eye(4)), (PAIR.cam1, PAIR.T_cam1_cam0))
+        for own, from_cam0 in ((pair.cam0, np.eye(4)), (pair.cam1, pair.T_cam1_cam0))
     ]
     return np.array(pixels) + rng.normal(0.0, NOISE_PX, (2, len(board_poses), len(corners), 2))
 
@@ -175,6 +182,34 @@ def test_advice_names_the_side_that_is_missing_and_keeps_its_promise():
     now_mm = max(uncertainty_map(after.pair, range_m).worst_mm for range_m in RANGES_M)
     # the noise found is 1.5 % off, and the curvature is that at another estimate
     assert now_mm == pytest.approx(advice.then_worst_sigma_mm, rel=0.1)
+
+
+def test_advice_for_a_pair_that_is_turned_in_keeps_its_promise():
+    """Axes that meet at 0.45 m, as for a specimen on a table; at 3 m nothing is seen by both cameras."""
+    K = [[7000.0, 0, 1223.5], [0, 7000.0, 1023.5], [0, 0, 1]]
+    camera = CameraModel(2448, 2048, K, [-0.1, 0.2, 0, 0, 0])
+    turn = pose_matrix([0.0, np.radians(20.0), 0.0], [0, 0, 0])
+    centre1 = pose_matrix([0, 0, 0], [-0.45 * np.tan(np.radians(20.0)), 0, 0])
+    pair, board = StereoPair(camera, camera, turn @ centre1), Board(10, 7, 0.01)
+    np.testing.assert_allclose(pair.middle_of_view(0.45), [0, 0, 0.45], atol=1e-9)
+    rng = np.random.default_rng(11)
+    seen = []
+    for _ in range(12):  # none nearer than 0.43 m
+        tilt = rng.uniform(0.2, 0.5) * np.exp(1j * rng.uniform(0, 2 * np.pi))
+        facing = pose_matrix([tilt.real, tilt.imag - np.radians(10.0), rng.uniform(-0.3, 0.3)], [0, 0, 0])
+        seen.append(pose_matrix([0, 0, 0], [*rng.uniform(-0.01, 0.01, 2), rng.uniform(0.43, 0.47)]) @ facing)
+    result = calibrate(see(seen, 12, print_m=1e-5, pair=pair, board=board), board, (2448, 2048))
+    ranges_m = working_ranges_m(result)
+    assert all(0.42 < range_m < 0.48 for range_m in ranges_m)
+    quality = judge(result, see(seen, 12, print_m=1e-5, pair=pair, board=board), board, 0)
+    assert quality.images[0].common.mean() > 0.5
+    assert [each.range_m for each in quality.uncertainty] == list(ranges_m)
+    advice = quality.next_view
+    assert advice.worst_sigma_mm == pytest.approx(max(each.worst_mm for each in quality.uncertainty), rel=1e-6)
+    assert advice.then_worst_sigma_mm < 0.9 * advice.worst_sigma_mm
+    after = calibrate(see([*seen, advice.T_cam0_board], 12, print_m=1e-5, pair=pair, board=board), board, (2448, 2048))
+    now_mm = max(uncertainty_map(after.pair, range_m).worst_mm for range_m in ranges_m)
+    assert now_mm == pytest.approx(advice.then_worst_sigma_mm, rel=0.1)  # as above
 
 
 def test_the_board_comes_nearer_with_the_edge_that_the_advice_names():
