@@ -70,12 +70,18 @@ def centre_pixels(side: RigSide, layout: MarkerLayout, side_name: str, lights_m:
     """
     if layout.light.dome_radius_m == 0.0 or len(layout.pairs_station_m) < LEAST_PAIRS:
         return pixels
-    stations = np.array(layout.pairs_station_m)
-    whole = np.stack([_completed(lights_m[:, row::2], stations) for row in (0, 1)], axis=2).reshape(lights_m.shape)
+    whole = all_places(layout, lights_m)
     normals = wing_normals(side_name, layout, whole)
     _, by_b = _dome_in_images(side, whole.reshape(-1, 3), normals.reshape(-1, 3))
     shift = DOME * layout.light.dome_radius_m * by_b.reshape(pixels.shape)
     return np.asarray(pixels - np.where(np.isfinite(shift), shift, 0.0))
+
+
+def all_places(layout: MarkerLayout, lights_m: Array) -> Array:
+    """(F, M, 3) of lights; those that are NaN are made up for by the three nearest of their row, if it has three."""
+    stations = np.array(layout.pairs_station_m)
+    rows = [_completed(lights_m[:, row::2], stations) for row in (0, 1)]
+    return np.stack(rows, axis=2).reshape(lights_m.shape)
 
 
 def bases_m(light: Light, centres: Array, normals: Array) -> Array:

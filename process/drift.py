@@ -228,9 +228,9 @@ def _lights(
     lights: pa.Table, name: str, side: RigSide, columns: dict[str, NDArray[Any]], edges: Sequence[tuple[float, float]]
 ) -> Iterator[Array]:
     """(L, 2, 2) means of the lights' pixels in each block."""
-    triggers, spots = lights_seen(lights, name, side)
+    sets = lights_seen(lights, name, side)
     for begin, end in edges:
-        own = np.isin(triggers, columns["trigger_index"][_during(columns, begin, end)])
-        seen = spots.pixels[own]
+        own = np.isin(sets.trigger_index, columns["trigger_index"][_during(columns, begin, end)])
+        seen = sets.spots.pixels[own]
         count = np.isfinite(seen).sum(axis=0)
         yield np.where(count > 0, np.nansum(seen, axis=0) / np.maximum(count, 1), np.nan)

@@ -23,6 +23,7 @@ LIGHTS_SCHEMA: pa.Schema = pa.schema(
         ("trigger_index", pa.int64()),
         ("side", pa.string()),
         ("light", pa.string()),
+        ("frame_timestamp_ns", pa.int64()),
         *((name, pa.float64()) for name in ("u0_px", "v0_px", "u1_px", "v1_px")),
         *((name, pa.float64()) for name in PIXEL_COVARIANCES),
     ]
@@ -45,6 +46,18 @@ class LightSpots:
     """(L, 2, 2, 2)"""
 
 
+@dataclass(frozen=True, eq=False)
+class LightSets:
+    """F sets of a side's L lights, as a table has them."""
+
+    trigger_index: NDArray[np.int64]
+    """(F,) growing"""
+    timestamp_ns: NDArray[np.int64]
+    """(F,) the sets' common instants"""
+    spots: LightSpots
+    """with F in front"""
+
+
 def light_spots(
     side: RigSide, spots: tuple[Detections, Detections]
 ) -> tuple[LightSpots, tuple[Detections, Detections]]:
@@ -60,15 +73,16 @@ def light_spots(
     return lights, (first, second)
 
 
-def lights_table(name: str, side: RigSide, seen: Iterable[tuple[int, LightSpots]]) -> pa.Table:
-    """A row for each set, given as its trigger index and spots, and light of the side called ``name``."""
+def lights_table(name: str, side: RigSide, seen: Iterable[tuple[int, int, LightSpots]]) -> pa.Table:
+    """A row for each set, given as trigger index, common instant and spots, and light of the side called ``name``."""
     sets = list(seen)
     if not sets:
         return LIGHTS_SCHEMA.empty_table()
-    pixels = np.concatenate([spots.pixels for _, spots in sets])
-    spread = np.concatenate([spots.covariance_px2 for _, spots in sets])
+    pixels = np.concatenate([spots.pixels for *_, spots in sets])
+    spread = np.concatenate([spots.covariance_px2 for *_, spots in sets])
     columns = {
-        "trigger_index": np.repeat([trigger for trigger, _ in sets], len(side.references)),
+        "trigger_index": np.repeat([trigger for trigger, *_ in sets], len(side.references)),
+        "frame_timestamp_ns": np.repeat([instant for _, instant, _ in sets], len(side.references)),
         "side": np.full(len(pixels), name, dtype=object),
         "light": np.tile(np.array([light.name for light in side.references], dtype=object), len(sets)),
     }
@@ -80,15 +94,15 @@ def lights_table(name: str, side: RigSide, seen: Iterable[tuple[int, LightSpots]
     return pa.table([pa.array(columns[one.name], one.type) for one in LIGHTS_SCHEMA], schema=LIGHTS_SCHEMA)
 
 
-def lights_seen(table: pa.Table, name: str, side: RigSide) -> tuple[NDArray[np.int64], LightSpots]:
-    """A lights table's sets of the side called ``name``: triggers (F,), growing, and spots with (F, L, …) in front.
-
-    Lights that the rig does not know are left out.
-    """
+def lights_seen(table: pa.Table, name: str, side: RigSide) -> LightSets:
+    """A lights table's sets of the side called ``name``; lights that the rig does not know are left out."""
     number = {light.name: at for at, light in enumerate(side.references)}
     light = np.array([number.get(one, -1) for one in table.column("light").to_pylist()], dtype=np.intp)
     rows = np.flatnonzero((np.array(table.column("side").to_pylist(), dtype=object) == name) & (light >= 0))
-    triggers, at = np.unique(table.column("trigger_index").to_numpy()[rows], return_inverse=True)
+    triggers, first, at = np.unique(
+        table.column("trigger_index").to_numpy()[rows], return_index=True, return_inverse=True
+    )
+    times = table.column("frame_timestamp_ns").to_numpy()[rows][first]
     shape = (len(triggers), len(side.references), 2)
     pixels, spread = np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan)
     for camera in (0, 1):
@@ -97,7 +111,7 @@ def lights_seen(table: pa.Table, name: str, side: RigSide) -> tuple[NDArray[np.i
         for column, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
             values = table.column(PIXEL_COVARIANCES[3 * camera + column]).to_numpy()[rows]
             spread[at, light[rows], camera, i, j] = spread[at, light[rows], camera, j, i] = values
-    return triggers, LightSpots(pixels, spread)
+    return LightSets(triggers, times, LightSpots(pixels, spread))
 
 
 def _numbers(side: RigSide, spots: tuple[Detections, Detections]) -> list[NDArray[np.intp]]:

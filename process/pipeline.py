@@ -103,7 +103,7 @@ class _Rows:
     columns: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in MARKER_SCHEMA.names})
     problems: list[str] = field(default_factory=list)
     rejected: Counter[str] = field(default_factory=Counter)
-    lights: list[tuple[int, LightSpots]] = field(default_factory=list)
+    lights: list[tuple[int, int, LightSpots]] = field(default_factory=list)
 
 
 def markers(
@@ -250,7 +250,7 @@ def _sightings(
         lights, others = light_spots(side, pair)
         pairs.append(others)
         if side.references:
-            into.lights.append((frames.trigger_index, lights))
+            into.lights.append((frames.trigger_index, set_instant_ns(frames, side), lights))
     found = sightings(name, side, rig.markers, pairs, settings.matching)
     return {frames.trigger_index: one for frames, one in zip(whole, found, strict=True)}
 

@@ -9,12 +9,13 @@ from typing import Any
 import pyarrow as pa
 
 from process.camera_model import Rig
+from process.fuselage_lights import LIGHTS_SCHEMA
 from process.parts import PartStore
 from process.shared_error import with_rig
 from process.tables import TableWriter
 from reconstruct.beside import Beside
 from reconstruct.stages import Key
-from reconstruct.tables import FRAMES, MARKERS, UNLOADED
+from reconstruct.tables import FRAMES, LIGHTS, MARKERS, UNLOADED
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Target:
     note: Mapping[str, Any]  # how they were made
     rig: Rig | None  # of the markers; None when they were given, and say themselves how they were made
     beside: Beside | None = None  # what was recorded beside the frames
+    lights: bool = False  # whether there are any on the fuselage
 
 
 @dataclass(frozen=True)
@@ -74,3 +76,7 @@ def _write_markers(store: PartStore, measured: Sequence[Key], target: Target) ->
     with TableWriter(target.out / MARKERS, schema, note, csv=target.csv) as writer:
         for key in measured:
             writer.append(store.read(key.markers).tables[MARKERS])
+    if target.lights:
+        with TableWriter(target.out / LIGHTS, LIGHTS_SCHEMA, target.note, csv=target.csv) as writer:
+            for key in measured:
+                writer.append(store.read(key.markers).tables[LIGHTS])

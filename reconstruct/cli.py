@@ -31,7 +31,7 @@ from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, REPORT, SUMMARY, read_json_object, read_result
 from reconstruct.run import Job, Progress, Step, run_comparison, run_job
 from reconstruct.static import static
-from reconstruct.summary import verdict
+from reconstruct.summary import motion_sentence, verdict
 from reconstruct.wing import example_path
 
 SHOWN_WARNINGS = 20
@@ -66,6 +66,7 @@ def run_command(
     reference: options.ReferenceFile = None,
     reference_window: options.ReferenceWindow = None,
     direct: options.Direct = False,
+    root_motion: options.RootMotion = True,
     dbc: DbcOption = None,
     max_gap: MaxGapOption = MAX_GAP_S,
     specific_force: options.Force = None,
@@ -108,6 +109,7 @@ def run_command(
         dbc=tuple(dbc or ()),
         max_gap_s=max_gap,
         direct=direct,
+        root_motion=root_motion,
         specific_force=None if specific_force is None else parse_specific_force(specific_force),
     )
     several = find_flights(flights)
@@ -132,6 +134,8 @@ def _run_one(job: Job, *, json: bool) -> None:
     say(f"markers seen    {summary['markers_seen_percent']:.2f} %")
     say(f"residual RMS    {summary['residual_rms_mm']:.3f} mm")
     say(f"tip sigma       {summary['sigma_tip_mm']:.2f} mm, {summary['sigma_tip_twist_deg']:.3f} deg (median)")
+    for side, moved in summary["root_motion"].items():
+        say(f"{'root ' + side:<15} {motion_sentence(moved)}")
     say(f"verdict         {' '.join(verdict(summary))}")
     say(f"time            {summary['wall_s']:.1f} s{_speed(summary)}, {summary['peak_mb']:.0f} MB")
     if summary["sets_without_shape"]:

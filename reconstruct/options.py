@@ -32,6 +32,10 @@ ReferenceWindow = Annotated[
 Direct = Annotated[
     bool, typer.Option("--direct", help="Fit both cameras' pixels: a light that one camera saw counts too.")
 ]
+RootMotion = Annotated[
+    bool,
+    typer.Option(help="Take out the cameras' motion against the fuselage, where the rig has lights that show it."),
+]
 Force = Annotated[
     str | None,
     typer.Option(help=f"Aerodynamic loads too, by these signals of the aircraft's acceleration: {NAMES}."),

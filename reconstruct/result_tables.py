@@ -17,12 +17,14 @@ from reconstruct.tables import (
     REFERENCE_POSITION,
     RESIDUAL,
     RESIDUALS,
+    ROOT_COLUMNS,
     SHAPE,
     SIGMA,
     STIFFNESS_COLUMNS,
     TIP_COLUMNS,
     UNLOADED,
     Floats,
+    Ints,
     Words,
     rms,
 )
@@ -93,12 +95,25 @@ def frames_table(fits: SideFits) -> pa.Table:
             "dof": fits.dof,
             **_flat(STIFFNESS_COLUMNS, fits.stiffness_change),
             **_flat([f"sigma_{name}" for name in STIFFNESS_COLUMNS], fits.sigma_stiffness),
+            **_root(fits),
             "markers_used": fits.used.sum(axis=1).astype(np.int32),
             "iterations": fits.iterations.astype(np.int32),
             "flags": _text(fits.flags),
             "reason": _text(fits.reason),
         }
     )
+
+
+def _root(fits: SideFits) -> dict[str, Floats | Ints]:
+    """How the cameras had moved against the fuselage; NaN where they were taken to be at rest."""
+    motion = fits.markers.motion
+    count = fits.trigger_index.size
+    change, sigma, lights = np.full((count, 6), np.nan), np.full((count, 6), np.nan), np.zeros(count, np.int64)
+    if motion is not None:
+        change, lights = motion.change, motion.lights
+        sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
+    named = _flat(ROOT_COLUMNS, change) | _flat([f"sigma_{name}" for name in ROOT_COLUMNS], sigma)
+    return {**named, "root_lights": lights}
 
 
 def loads_table(fits: SideFits) -> pa.Table:

@@ -16,6 +16,7 @@ import pyarrow as pa
 from capture.errors import ReconstructError, UsageError
 from process.camera_model import Rig
 from process.flight_cameras import check_cameras
+from process.fuselage_lights import LIGHTS_SCHEMA, lights_path
 from process.json_file import provenance, write_json
 from process.memory import MemoryWatch
 from process.parts import PartStore
@@ -38,11 +39,12 @@ from reconstruct.observed import measured_markers
 from reconstruct.reference import Reference
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_json_object, read_result
+from reconstruct.root_motion import RootMotion
 from reconstruct.scene import SCENE, write_scene
 from reconstruct.shared import SharedError, shared_errors
-from reconstruct.stages import Cameras, FitPlan, Key, fit, measure, sampled, take
+from reconstruct.stages import Cameras, FitPlan, Key, fit, measure, root_motions, sampled, take
 from reconstruct.summary import holes, summarise
-from reconstruct.tables import FRAMES, LOADS, MARKERS, RESIDUALS, SHAPE, SIDES, MarkerSeries, read_table
+from reconstruct.tables import FRAMES, LIGHTS, LOADS, MARKERS, RESIDUALS, SHAPE, SIDES, MarkerSeries, read_table
 from reconstruct.wing import Wing, read_wing
 
 PARTS = ".parts"
@@ -88,6 +90,7 @@ class Job:
     max_gap_s: float = MAX_GAP_S  # that signals are interpolated over
     direct: bool = False  # fit both cameras' pixels, not triangulated places
     specific_force: SpecificForce | None = None  # signals that tell the aircraft's acceleration; None: net loads only
+    root_motion: bool = True  # take out the cameras' motion against the fuselage, where lights on it show it
 
 
 @dataclass
@@ -148,6 +151,7 @@ def run_job(
         try:
             measured = source.measure(store, hands, progress)
             clock.measured = time.monotonic()
+            plan = dataclasses.replace(plan, root=source.root_motions(measured, store))
             fitted = fit(measured, plan, store, hands, _telling(progress, "fit", source.flight_s), source.name)
             clock.fitted = time.monotonic()
         except UsageError:  # nothing that another run could go on with
@@ -156,7 +160,8 @@ def run_job(
                 job.out.rmdir()
             raise
         _remove_stale(job)
-        found = assemble(store, measured, fitted, Target(job.out, job.csv, note, source.rig, source.beside))
+        target = Target(job.out, job.csv, note, source.rig, source.beside, source.has_lights)
+        found = assemble(store, measured, fitted, target)
         if job.specific_force is not None:
             air = air_table(wing, job.out / SHAPE, found.frames, job.specific_force)
             with TableWriter(job.out / AIR, air.schema, note, csv=job.csv) as writer:
@@ -170,6 +175,7 @@ def run_job(
         "reference": found.wings.column("reference")[0].as_py(),
         "at_rest": {one.side: one.as_dict() for one in hangs},
         "direct": job.direct,
+        "root_motion": {side: one.figures(wing.half(side).rest_position_m[-1]) for side, one in plan.root.items()},
         "smoothed_s": job.smooth_s,
         "warnings": [
             *_warnings(wing, sampled(fitted, wing, store, source.name)),
@@ -226,8 +232,11 @@ class _Source:
         self._job = job
         self._recording: Recording | None = None
         self._table: pa.Table | None = None
+        self._lights: pa.Table = LIGHTS_SCHEMA.empty_table()
         if job.markers is not None:
             self._table = read_table(job.markers, ())
+            if lights_path(job.markers).is_file():
+                self._lights = read_table(lights_path(job.markers), LIGHTS_SCHEMA.names)
             self.name = str(job.markers)
             self.beside = beside_markers(job.markers)
             self.shared = shared_errors(self._table)
@@ -261,6 +270,20 @@ class _Source:
             self.flight_s = self._recording.duration_s
 
     @property
+    def has_lights(self) -> bool:
+        """Whether lights on the fuselage were looked for."""
+        if self.rig is not None:
+            return any(self.rig.side(side).references for side in SIDES)
+        return bool(self._lights.num_rows)
+
+    def root_motions(self, measured: Sequence[Key], store: PartStore) -> dict[str, RootMotion]:
+        """How the cameras have moved, by side, where that is asked for and known."""
+        if not self._job.root_motion or not self.has_lights:
+            return {}
+        sides = sides_of(self._table) if self.rig is None else {side: self.rig.side(side) for side in SIDES}
+        return root_motions(measured, store, sides)
+
+    @property
     def reading_s(self) -> float | None:
         """How long reading the frames takes by itself; None when there were none, or others read them."""
         if self._recording is None or self._job.scheduler is not None:
@@ -270,12 +293,15 @@ class _Source:
     def note(self, plan: FitPlan) -> dict[str, Any]:
         """How a result of it is made: all that the result depends on."""
         job = self._job
-        inputs = [path for path in (job.wing, job.rig, job.markers, _reference_file(job), *job.dbc) if path is not None]
+        lights = lights_path(job.markers) if job.markers is not None and self._lights.num_rows else None
+        paths = (job.wing, job.rig, job.markers, lights, _reference_file(job), *job.dbc)
+        inputs = [path for path in paths if path is not None]
         config = {
             "measuring": dataclasses.asdict(job.settings),
             "instants": dataclasses.asdict(plan.instants),
             "direct": plan.cameras is not None,
             "smooth_s": plan.smooth_s,
+            "root_motion": job.root_motion,
             "reference": None if plan.reference is None else str(plan.reference),
         }
         recording = {} if self._recording is None else self._recording.fingerprints
@@ -284,7 +310,7 @@ class _Source:
     def measure(self, store: PartStore, hands: Crew, progress: Progress) -> list[Key]:
         """The keys of the blocks that there are, measured."""
         if self._recording is None or self.rig is None:
-            return take(self._table, self.name, store)
+            return take(self._table, self._lights, self.name, store)
         tell = _telling(progress, "markers", self.flight_s)
         return measure(self._recording, self.rig, self._job.settings, store, hands, tell)
 
@@ -314,8 +340,8 @@ def _telling(progress: Progress, stage: str, flight_s: float) -> Callable[[int, 
 
 def _remove_stale(job: Job) -> None:
     """A run that fails half way must not leave an older one's words."""
-    texts = [Path(name).with_suffix(".csv").name for name in (SHAPE, FRAMES, LOADS, RESIDUALS, MARKERS, AIR)]
-    for stale in (AIR, REPORT, SCENE, MAT, NETCDF, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
+    texts = [Path(name).with_suffix(".csv").name for name in (SHAPE, FRAMES, LOADS, RESIDUALS, MARKERS, LIGHTS, AIR)]
+    for stale in (LIGHTS, AIR, REPORT, SCENE, MAT, NETCDF, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
         (job.out / stale).unlink(missing_ok=True)
 
 

@@ -17,6 +17,7 @@ from reconstruct.fit import Fit, Unscaled, fit_measured, scale_of, with_residual
 from reconstruct.instants import InstantSettings
 from reconstruct.observed import Observed, enough_markers, measured_markers, observe
 from reconstruct.reference import Reference, ReferenceShape, mean_of, recorded, unloaded
+from reconstruct.root_motion import sigma_by_motion
 from reconstruct.shared import SharedError, shared_errors, sigma_of
 from reconstruct.smooth import smooth_fits
 from reconstruct.tables import (
@@ -26,6 +27,7 @@ from reconstruct.tables import (
     Floats,
     Ints,
     MarkerSeries,
+    SetMotion,
     Words,
     marker_series,
     read_table,
@@ -81,7 +83,7 @@ class SideFits:
     chi2: Floats  # (F,)
     dof: Floats  # (F,)
     iterations: Ints  # (F,)
-    flags: Words  # (F,) str, empty when good: not_fitted, outlier (markers left out), row_time, bridged
+    flags: Words  # (F,) str, empty when good: not_fitted, outlier (markers left out), row_time, bridged, no_lights
     reason: Words  # (F,) str, why a set could not be fitted
     smoothed_s: float  # correlation time of the smoothing; 0: every set by itself
 
@@ -232,7 +234,8 @@ def fit_stretch(job: FitJob) -> SideFits:
     how, stretch = job.how.get(), job.stretch
     own = slice(stretch.first, stretch.last)
     points, fits = _fits(how, stretch)
-    return _gather(how, stretch.markers[own], points, _rows(how, fits))
+    markers = stretch.markers[own]
+    return _gather(how, markers, points, _rows(how, fits, markers.motion))
 
 
 def window_fits(job: FitJob) -> list[Fit]:
@@ -374,21 +377,25 @@ def fits_in_turn(posed: Iterable[Unscaled], settings: FitSettings, prior_scale: 
         yield fit
 
 
-def _rows(how: FitHow, fits: Iterable[Fit]) -> _Rows:
+def _rows(how: FitHow, fits: Iterable[Fit], motion: SetMotion | None) -> _Rows:
     """What SideFits has of fits, an array a field; the rest of a fit is dropped here, where it was made."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     reference = how.reference or unloaded(how.half)
     waiting = iter(fits)
     while some := list(islice(waiting, SETS_AT_ONCE)):
         responses = None if how.shared is None else how.shared.of_shapes(how.half, some)
         for k, fit in enumerate(some):
-            rows.append(_row(how.half, fit, None if responses is None else responses[k], reference))
+            root = None if motion is None or not fit.converged else sigma_by_motion(how.half, fit, motion, len(rows))
+            rows.append(_row(how.half, fit, None if responses is None else responses[k], reference, root))
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def _row(half: HalfWing, fit: Fit, shared: Floats | None, reference: ReferenceShape) -> dict[str, Any]:
+def _row(
+    half: HalfWing, fit: Fit, shared: Floats | None, reference: ReferenceShape, root: Floats | None
+) -> dict[str, Any]:
     net, sigma_net = _net(half, fit)
     noise = np.column_stack([fit.sigma_position_m, fit.sigma_twist_rad])
+    noise = noise if root is None else np.hypot(noise, root)
     response = np.zeros((*noise.shape, 1)) if shared is None else shared
     change = response if reference.shared is None else response - reference.shared
     sigma = np.hypot(noise, sigma_of(response))
@@ -435,6 +442,8 @@ def _gather(how: FitHow, series: MarkerSeries, points: Ints, rows: _Rows) -> Sid
     alone = (rows["used"] & (points == 1)).any(axis=1)
     bridged = (reason == "") & ~rows["used"].any(axis=1)
     flagged = {"not_fitted": reason != "", "outlier": outliers > 0, "row_time": alone, "bridged": bridged}
+    if series.motion is not None:
+        flagged["no_lights"] = series.motion.lights == 0
     return SideFits(
         side=series.side,
         trigger_index=series.trigger_index,

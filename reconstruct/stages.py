@@ -19,6 +19,7 @@ from reconstruct.instants import InstantSettings
 from reconstruct.observed import Observed, enough_markers, measured_markers, observe, with_centroids
 from reconstruct.reference import Reference
 from reconstruct.result_tables import part_tables
+from reconstruct.root_motion import RootMotion, root_motion, with_motion
 from reconstruct.series import (
     NOTHING_MEASURED,
     FitHow,
@@ -37,7 +38,7 @@ from reconstruct.series import (
 )
 from reconstruct.shared import SharedError
 from reconstruct.summary import tally
-from reconstruct.tables import MARKERS, Floats, MarkerSeries, marker_series
+from reconstruct.tables import LIGHTS, MARKERS, Floats, MarkerSeries, marker_series
 from reconstruct.wing import Wing
 
 CACHED_BLOCKS = 16
@@ -82,6 +83,7 @@ class FitPlan:
     reference: Reference
     instants: InstantSettings = field(default_factory=InstantSettings)
     cameras: Cameras | None = None  # whose pixels are fitted; None: markers' places are
+    root: Mapping[str, RootMotion] = field(default_factory=dict)  # by side; of others the cameras are at rest
 
     def of(self, side: str) -> FitHow:
         """How its sets of one side are fitted, but for the prior's scale and the reference."""
@@ -110,17 +112,22 @@ def measure(
     tell(done, total)
     for number, found in hands.results(measure_block, (BlockJob(block, how) for _, block in todo)):
         note = {"problems": list(found.problems), "rejected": found.rejected}
-        store.write(todo[number][0].markers, Part({MARKERS: found.table}, note))
+        store.write(todo[number][0].markers, Part({MARKERS: found.table, LIGHTS: found.lights}, note))
         done += len(todo[number][1].places)
         tell(done, total)
     return sorted(keys)
 
 
-def take(table: pa.Table, name: str, store: PartStore) -> list[Key]:
-    """Cut a marker table into blocks, instead of measuring them. Raises UsageError when it is not a marker table."""
+def take(table: pa.Table, lights: pa.Table, name: str, store: PartStore) -> list[Key]:
+    """Cut a marker table and its fuselage lights into blocks, instead of measuring them.
+
+    Raises UsageError when it is not a marker table.
+    """
     series = marker_series(table, name)  # checks it whole, before it is cut
     side = np.asarray(table.column("side").to_numpy(zero_copy_only=False))
     block = np.asarray(table.column("trigger_index").to_numpy()) // BLOCK_TRIGGERS
+    lights_block = lights.column("trigger_index").to_numpy() // BLOCK_TRIGGERS
+    lights_side = np.asarray(lights.column("side").to_numpy(zero_copy_only=False))
     keys = []
     for one in sorted(series):
         own = np.flatnonzero(side == one)
@@ -129,8 +136,25 @@ def take(table: pa.Table, name: str, store: PartStore) -> list[Key]:
             keys.append(key)
             if key.markers not in store:
                 rows = table.take(pa.array(own[block[own] == number]))
-                store.write(key.markers, Part({MARKERS: rows}, {"problems": [], "rejected": {}}))
+                beside = lights.filter(pa.array((lights_side == one) & (lights_block == number)))
+                store.write(key.markers, Part({MARKERS: rows, LIGHTS: beside}, {"problems": [], "rejected": {}}))
     return sorted(keys)
+
+
+def root_motions(keys: Sequence[Key], store: PartStore, sides: Mapping[str, RigSide]) -> dict[str, RootMotion]:
+    """How the pairs have moved, by the lights of the measured blocks; a side whose lights do not show it is left out.
+
+    ``sides`` are the pairs as surveyed, by name.
+    """
+    found = {}
+    for name, side in sides.items():
+        own = [key for key in keys if key.side == name]
+        if own and side.references:
+            lights = pa.concat_tables([store.read(key.markers).tables[LIGHTS] for key in own])
+            motion = root_motion(lights, name, side)
+            if motion is not None:
+                found[name] = motion
+    return found
 
 
 def fit(keys: Sequence[Key], plan: FitPlan, store: PartStore, hands: Crew, tell: Tell, name: str) -> list[Key]:
@@ -201,7 +225,9 @@ class _Markers:
         self._around_s = plan.of("left").around_s
         self._plan = plan
         self._enough: dict[Key, NDArray[np.intp]] = {}
-        self._series = lru_cache(maxsize=CACHED_BLOCKS)(lambda key: _series(key, plan.wing, store, name, plan.cameras))
+        self._series = lru_cache(maxsize=CACHED_BLOCKS)(
+            lambda key: _series(key, plan.wing, store, name, plan.cameras, plan.root.get(key.side))
+        )
         anything = False
         starts_ns = []
         for key in keys:
@@ -259,8 +285,13 @@ class _Markers:
         return series
 
 
-def _series(key: Key, wing: Wing, store: PartStore, name: str, cameras: Cameras | None = None) -> MarkerSeries | None:
-    """A measured block, with pixels if ``cameras`` are given; None when none of its frames could be read."""
+def _series(
+    key: Key, wing: Wing, store: PartStore, name: str, cameras: Cameras | None = None, root: RootMotion | None = None
+) -> MarkerSeries | None:
+    """A measured block, with pixels if ``cameras`` are given; None when none of its frames could be read.
+
+    ``root`` is the motion of its cameras, that markers are to be free of.
+    """
     table = store.read(key.markers).tables[MARKERS]
     if not table.num_rows:
         return None
@@ -269,6 +300,9 @@ def _series(key: Key, wing: Wing, store: PartStore, name: str, cameras: Cameras 
         if key.side not in cameras.sides:
             raise UsageError(f"{name}: does not say which cameras saw the {key.side} wing; leave --direct out")
         series = with_centroids(series, table, cameras.sides[key.side], cameras.layout, name)
+    if root is not None:
+        own = (None, None) if cameras is None else (cameras.sides[key.side], cameras.layout)
+        series = with_motion(series, root, *own)
     return as_in(wing.half(key.side), series)
 
 

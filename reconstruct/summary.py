@@ -115,6 +115,14 @@ def _median(values: Floats) -> float | None:
     return float(np.median(known)) if known.size else None
 
 
+def motion_sentence(moved: Mapping[str, Any]) -> str:
+    """What the cameras' motion against the fuselage was, by a side's figures under ``root_motion``."""
+    return (
+        f"cameras moved by up to {moved['turn_mrad']:.2f} mrad, {moved['shift_mm']:.2f} mm since the {moved['since']}: "
+        f"{moved['tip_rms_mm']:.2f} +- {moved['sigma_tip_mm']:.2f} mm RMS at the tip, taken out"
+    )
+
+
 def verdict(summary: Mapping[str, Any]) -> list[str]:
     """What a reader should know of the data's quality, most important first; starts with one word."""
     seen, fitted = summary["markers_seen_percent"], summary["converged_percent"]

@@ -22,6 +22,7 @@ Words = npt.NDArray[np.object_]
 
 SIDES = ("left", "right")
 MARKERS = "markers.parquet"
+LIGHTS = "markers_lights.parquet"
 SHAPE = "shape.parquet"
 FRAMES = "frames.parquet"
 LOADS = "loads.parquet"
@@ -39,6 +40,7 @@ STIFFNESS_COLUMNS = ("stiffness_ea", "stiffness_gj", "stiffness_ei_out", "stiffn
 REFERENCE_POSITION = ("reference_x_m", "reference_y_m", "reference_z_m")
 RESIDUAL = ("residual_x_m", "residual_y_m", "residual_z_m")
 LOAD_COLUMNS = ("fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
+ROOT_COLUMNS = ("root_turn_x_rad", "root_turn_y_rad", "root_turn_z_rad", "root_dx_m", "root_dy_m", "root_dz_m")
 NET_COLUMNS = tuple(f"net_{name}" for name in LOAD_COLUMNS)
 TIME_COLUMNS = ("time_sigma_ns", "ptp_state")
 _PER_SET = (  # of MarkerSeries
@@ -72,6 +74,26 @@ class Centroids:
         return cls(*(np.concatenate([getattr(one, member.name) for one in parts]) for member in fields(cls)))
 
 
+@dataclass(frozen=True, eq=False)
+class SetMotion:
+    """How a camera pair has moved against the fuselage, in F sets: x → exp(ω) (x − c) + c + δ, body frame."""
+
+    change: Floats  # (F, 6) turn ω (rad) and shift δ (m)
+    covariance: Floats  # (F, 6, 6)
+    lights: Ints  # (F,) on the fuselage, that told; 0: it is what other sets make likely
+    centre_m: Floats  # (3,) c, the centre of cam0 at rest
+
+    def __getitem__(self, rows: slice | Ints) -> "SetMotion":
+        """Some of the sets."""
+        return replace(self, change=self.change[rows], covariance=self.covariance[rows], lights=self.lights[rows])
+
+    @classmethod
+    def join(cls, parts: Sequence["SetMotion"]) -> "SetMotion":
+        """The sets of all ``parts``, at least one, which are of one pair."""
+        names = ("change", "covariance", "lights")
+        return replace(parts[0], **{name: np.concatenate([getattr(one, name) for one in parts]) for name in names})
+
+
 @dataclass(frozen=True)
 class MarkerSeries:
     """One side's markers, dense over F sets and M markers; what was not measured is NaN."""
@@ -87,6 +109,7 @@ class MarkerSeries:
     time_sigma_ns: Floats  # (F,) one sigma of the common instant; NaN: not known
     ptp_state: Words  # (F,) str, of the recorder's PTP port; UNKNOWN where the table does not say
     centroids: Centroids | None = None  # for direct mode
+    motion: SetMotion | None = None  # of the cameras, that places and pixels are free of; None: they were at rest
 
     @property
     def seen(self) -> Bools:
@@ -96,14 +119,23 @@ class MarkerSeries:
     def __getitem__(self, rows: slice) -> "MarkerSeries":
         """Some of the sets."""
         centroids = None if self.centroids is None else self.centroids[rows]
-        return replace(self, centroids=centroids, **{name: getattr(self, name)[rows] for name in _PER_SET})
+        motion = None if self.motion is None else self.motion[rows]
+        return replace(
+            self, centroids=centroids, motion=motion, **{name: getattr(self, name)[rows] for name in _PER_SET}
+        )
 
     @classmethod
     def join(cls, parts: Sequence["MarkerSeries"]) -> "MarkerSeries":
         """The sets of all ``parts``, at least one, which have the same markers."""
         whole: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _PER_SET}
         centroids = [one.centroids for one in parts if one.centroids is not None]
-        return replace(parts[0], centroids=Centroids.join(centroids) if centroids else None, **whole)
+        motions = [one.motion for one in parts if one.motion is not None]
+        return replace(
+            parts[0],
+            centroids=Centroids.join(centroids) if centroids else None,
+            motion=SetMotion.join(motions) if motions else None,
+            **whole,
+        )
 
 
 @dataclass(frozen=True)

@@ -123,8 +123,10 @@ def test_lights_on_the_fuselage_show_the_rest(tmp_path, small_world, painter, re
     measured_flight = markers([tmp_path], rig, workers=1)
     table = measured_flight.table
     assert np.isfinite(table.column("x_m").to_numpy()).reshape(8, 18)[:, :12].all()
-    triggers, spots = lights_seen(measured_flight.lights, "right", rig.right)
-    assert triggers.tolist() == list(range(8))
+    sets = lights_seen(measured_flight.lights, "right", rig.right)
+    assert sets.trigger_index.tolist() == list(range(8))
+    assert sets.timestamp_ns[7] - sets.timestamp_ns[0] == 7 * 2_500_000_000
+    spots = sets.spots
     assert (
         np.abs(
             spots.pixels[0] - np.stack(seen_by(small_world, small_world.rig.right, np.array(LIGHTS_M)), axis=1)
