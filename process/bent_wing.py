@@ -9,6 +9,7 @@ Array = NDArray[np.float64]
 
 _PULL = np.array([0.02, 0.03, 0.05, 0.08, 0.05, 0.05, 0.08])
 """of each column of ``BentWing.basis`` towards not bending"""
+_PRIOR = np.diag(_PULL**2)
 _FEWEST_FREE = 3.0
 """numbers measured on each axis beyond what bending takes up"""
 
@@ -46,16 +47,18 @@ class BentWing:
         along = np.empty_like(middles)
         along[1:-1] = (middles[2:] - middles[:-2]) / 2.0
         along[0], along[-1] = middles[1] - middles[0], middles[-1] - middles[-2]
-        span = np.repeat(along / np.linalg.norm(along, axis=1)[:, None], 2, axis=0)
-        chord = np.broadcast_to(np.array([-1.0, 0.0, 0.0]), span.shape)
-        chord = chord - np.sum(chord * span, axis=1)[:, None] * span
-        chord = chord / np.linalg.norm(chord, axis=1)[:, None]
-        return np.stack([span, chord, np.cross(span, chord)], axis=1)
+        x, y, z = (along / np.sqrt(np.sum(along * along, axis=1))[:, None]).T
+        # the chord is what of (−1, 0, 0) is across the span, the normal span × chord
+        across = np.sqrt(1.0 - x * x)
+        nothing = np.zeros_like(x)
+        rows = np.array([x, y, z, -across, x * y / across, x * z / across, nothing, -z / across, y / across])
+        return np.repeat(rows.T.reshape(-1, 3, 3), 2, axis=0)
 
     def bend_to(self, places_m: Array, measured_m: Array, seen: NDArray[np.bool_]) -> Array:
         """``places_m`` moved smoothly to ``measured_m`` where ``seen``; a weak pull keeps it from running off."""
-        own = self.basis[seen]
-        bend = np.linalg.solve(own.T @ own + np.diag(_PULL**2), own.T @ (measured_m - places_m)[seen])
+        own = self.basis * seen[:, None]
+        apart = np.where(seen[:, None], measured_m - places_m, 0.0)
+        bend = np.linalg.solve(own.T @ own + _PRIOR, own.T @ apart)
         return np.asarray(places_m + self.basis @ bend)
 
     def predicted(
@@ -67,7 +70,7 @@ class BentWing:
         to say.
         """
         given = self.basis[seen]
-        covariance = np.linalg.inv(given.T @ given + np.diag(_PULL**2))
+        covariance = np.linalg.inv(given.T @ given + _PRIOR)
         free = len(given) - float(np.sum((given @ covariance) * given))
         if free < _FEWEST_FREE:
             return None

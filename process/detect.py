@@ -1,7 +1,7 @@
 """A frame to its light spots: sub-pixel centres with covariances, and what was turned down and why."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from typing import Literal
@@ -104,56 +104,78 @@ def detect(image: Pixels, settings: DetectSettings | None = None) -> Detections:
 
 def detect_all(images: Sequence[Pixels], settings: DetectSettings) -> list[Detections]:
     """``detect`` for several images, faster than one by one."""
-    if settings.method == "paper":
-        return [_detect_paper(image, settings) for image in images]
-    sights = [_sight(image, settings) for image in images]
-    lit = [sight for sight in sights if len(sight.blobs)]
-    fits = iter(_fit_sights(lit, settings) if lit else ())
-    return [_judged(sight, next(fits), settings) if len(sight.blobs) else _nothing(sight) for sight in sights]
+    return detections([sight(image, settings) for image in images], settings)
 
 
 @dataclass(eq=False)
-class _Sight:
-    """One image's candidates, before anything is fitted to them."""
+class Sight:
+    """One image's candidates, before anything is fitted to them, and all that is needed of the image for that."""
 
-    scene: Scene
     blobs: Blobs
-    start: Array  # (N, 8)
-    half_widths: NDArray[np.intp]  # (N,) of the patches
+    start: Array
+    """(N, 8)"""
+    patches: Patches
+    """round ones about the candidates, without what is nearer to a rejected blob"""
+    apart: Array
+    """(K,) their usable pixels, without those nearer to another candidate, too"""
+    half_widths: NDArray[np.intp]
+    """(N,) of the patches, pixels"""
+    floor: float
+    """grey levels of background that the blobs' peaks are counted from"""
+    rejected: list[Rejected]
+
+    def __len__(self) -> int:
+        return len(self.blobs)
+
+    def reject(self, candidate: int, reason: str) -> None:
+        """Note that a candidate is turned down."""
+        blobs = self.blobs
+        self.rejected.append(Rejected(float(blobs.u_px[candidate]), float(blobs.v_px[candidate]), reason))
 
 
-def _sight(image: Pixels, settings: DetectSettings) -> _Sight:
+def sight(image: Pixels, settings: DetectSettings) -> Sight | Detections:
+    """What ``detections`` needs of an image, which is not looked at again; without candidates, or by ``paper``, all."""
+    if settings.method == "paper":
+        return _detect_paper(image, settings)
     scene = scene_of(image, settings.contrast)
     blobs = find_blobs(scene, settings.largest_radius_px, settings.least_roundness)
+    if not len(blobs):
+        return _nothing(scene.rejected)
     half_widths = np.clip(
         np.ceil(np.sqrt(blobs.area_px / np.pi) + _RIM_PX), _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH
     ).astype(np.intp)
-    return _Sight(scene, blobs, _start(scene, blobs), half_widths)
+    start = _start(scene, blobs)
+    patches, apart = _patches(scene, start[:, :2], half_widths, settings)
+    return Sight(blobs, start, patches, apart, half_widths, scene.floor, scene.rejected)
 
 
-def _fit_sights(sights: Sequence[_Sight], settings: DetectSettings) -> list[Fit]:
-    """What was fitted in each image; all images' spots are fitted together."""
-    patches = Patches.join(
-        [_patches(one.scene, one.start, np.arange(len(one.blobs)), one.half_widths, settings) for one in sights]
-    )
+def detections(sights: Sequence[Sight | Detections], settings: DetectSettings) -> list[Detections]:
+    """The lights of each image: all images' candidates are fitted together."""
+    open_ = [one for one in sights if isinstance(one, Sight)]
+    fits = iter(_fit_sights(open_, settings) if open_ else ())
+    return [_judged(one, next(fits), settings) if isinstance(one, Sight) else one for one in sights]
+
+
+def _fit_sights(sights: Sequence[Sight], settings: DetectSettings) -> list[Fit]:
+    """What was fitted in each image."""
+    patches = Patches.join([one.patches for one in sights])
+    patches = replace(patches, usable=np.concatenate([one.apart for one in sights]))
     start = np.concatenate([one.start for one in sights])
     curve, start[:, EDGE] = start_shape(patches, start, np.concatenate([one.blobs.area_px for one in sights]))
     start[:, CURVE_UU] = start[:, CURVE_VV] = curve
-    ends = np.cumsum([len(one.blobs) for one in sights]).tolist()
+    ends = np.cumsum([len(one) for one in sights]).tolist()
     parts = [slice(begin, end) for begin, end in pairwise([0, *ends])]
-    for one, part in zip(sights, parts, strict=True):
-        one.start = start[part]
     if settings.method == "fast":
         centres = windowed_centres(patches, start)
         fit = Fit(start, centres.covariance_px2, np.ones(len(start)), centres.converged)
         fit.parameters[:, :2] = centres.centres_px
     else:
         fit = fit_spots(patches, start)
-        _fit_neighbours_again(sights, [fit[part] for part in parts], settings)
+        _fit_neighbours_again(sights, [fit[part] for part in parts])
     return [fit[part] for part in parts]
 
 
-def _fit_neighbours_again(sights: Sequence[_Sight], fits: Sequence[Fit], settings: DetectSettings) -> None:
+def _fit_neighbours_again(sights: Sequence[Sight], fits: Sequence[Fit]) -> None:
     """Fit those once more, in place, that have a neighbour in reach, its light taken out."""
     members, patches, others, start = [], [], [], []
     for one, fit in zip(sights, fits, strict=True):
@@ -162,7 +184,7 @@ def _fit_neighbours_again(sights: Sequence[_Sight], fits: Sequence[Fit], setting
         own = np.flatnonzero(near.any(axis=1) & fit.converged)
         members.append(own)
         if own.size:
-            around = _patches(one.scene, one.start, own, one.half_widths, settings, apart=False)
+            around = one.patches[own]
             patches.append(around)
             others.append(_light_of_others(around, fit.parameters, own, near))
             start.append(fit.parameters[own])
@@ -177,23 +199,28 @@ def _fit_neighbours_again(sights: Sequence[_Sight], fits: Sequence[Fit], setting
         fit.chi2_per_dof[own], fit.converged[own] = part.chi2_per_dof, part.converged
 
 
-def _judged(sight: _Sight, fit: Fit, settings: DetectSettings) -> Detections:
-    """The spots that are lights; the others are noted in the scene."""
-    scene, blobs = sight.scene, sight.blobs
-    keep = _without_bad_fits(scene, blobs, fit)
-    keep = _without_reflections(scene, blobs, fit, keep, settings)
-    saturated = blobs.peak[keep] + scene.floor >= settings.saturation
+def _judged(sight: Sight, fit: Fit, settings: DetectSettings) -> Detections:
+    """The spots that are lights; why the others are not is noted."""
+    keep = _without_bad_fits(sight, fit)
+    keep = _without_reflections(sight, fit, keep, settings)
+    blobs = sight.blobs[keep]
+    saturated = blobs.peak + sight.floor >= settings.saturation
     parameters = fit.parameters[keep]
-    return _detections(
-        blobs[keep], parameters[:, :2], fit.covariance_px2[keep], parameters[:, AMPLITUDE], saturated, scene.rejected
+    return Detections(
+        parameters[:, U].copy(),
+        parameters[:, V].copy(),
+        fit.covariance_px2[keep],
+        parameters[:, AMPLITUDE].copy(),
+        blobs.area_px,
+        blobs.circularity,
+        tuple("saturated" if yes else "" for yes in saturated.tolist()),
+        tuple(sight.rejected),
     )
 
 
-def _nothing(sight: _Sight) -> Detections:
+def _nothing(rejected: Sequence[Rejected]) -> Detections:
     empty = np.empty(0)
-    return _detections(
-        sight.blobs, np.empty((0, 2)), np.empty((0, 2, 2)), empty, np.empty(0, bool), sight.scene.rejected
-    )
+    return Detections(empty, empty, np.empty((0, 2, 2)), empty, empty, empty, (), tuple(rejected))
 
 
 def _start(scene: Scene, blobs: Blobs) -> Array:
@@ -218,44 +245,46 @@ def _disc(half_width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _patches(
-    scene: Scene,
-    start: Array,
-    members: NDArray[np.intp],
-    half_widths: NDArray[np.intp],
-    settings: DetectSettings,
-    *,
-    apart: bool = True,
-) -> Patches:
-    """Round patches about ``start[members]``, without what is nearer to a rejected blob or, ``apart``, another spot."""
-    own = start[members, :2]
-    discs = [_disc(half_width) for half_width in half_widths[members].tolist()]
-    counts = np.array([len(disc[0]) for disc in discs])
-    corner = np.repeat(np.rint(own).astype(np.intp).T, counts, axis=1)
+    scene: Scene, centres_px: Array, half_widths: NDArray[np.intp], settings: DetectSettings
+) -> tuple[Patches, Array]:
+    """Round patches about centres (N, 2), usable but for what is nearer to a rejected blob; and (K,) to each other."""
+    discs = [_disc(half_width) for half_width in half_widths.tolist()]
+    counts = np.array([len(disc[0]) for disc in discs], dtype=np.intp)
+    corner = np.repeat(np.rint(centres_px).astype(np.intp).T, counts, axis=1)
     columns, rows = (np.concatenate([disc[k] for disc in discs]) + corner[k] for k in (0, 1))
     height, width = scene.image.shape
-    usable = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    rivals = np.array([(r.u_px, r.v_px) for r in scene.rejected if np.isfinite(r.u_px)]).reshape(-1, 2)
-    if apart:
-        rivals = np.concatenate([rivals, start[:, :2]])
-    gap = np.hypot(own[:, None, 0] - rivals[None, :, 0], own[:, None, 1] - rivals[None, :, 1])
-    begins = np.cumsum(counts) - counts
-    for number, rival in zip(*np.nonzero((gap > 0.0) & (gap < 3.0 * half_widths[members, None])), strict=True):
-        pixels = slice(begins[number], begins[number] + counts[number])
-        # nearer to the spot than to its rival: on the near side of the line half way between them
-        towards, middle = rivals[rival] - own[number], (rivals[rival] + own[number]) / 2.0
-        usable[pixels] &= (columns[pixels] - middle[0]) * towards[0] + (rows[pixels] - middle[1]) * towards[1] <= 0.0
-    if not usable.all():
-        counts = np.add.reduceat(usable.astype(np.intp), begins)
-        columns, rows = columns[usable], rows[usable]
-    return Patches(
+    usable = ((columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)).astype(np.float64)
+    np.clip(columns, 0, width - 1, out=columns)
+    np.clip(rows, 0, height - 1, out=rows)
+    patches = Patches(
         columns.astype(np.float64),
         rows.astype(np.float64),
         scene.image[rows, columns].astype(np.float64),
+        usable,
         counts,
         np.full(len(counts), scene.sigma),
         settings.shot_gain,
         float(settings.saturation),
     )
+    rejected = np.array([(r.u_px, r.v_px) for r in scene.rejected if np.isfinite(r.u_px)]).reshape(-1, 2)
+    _leave_to_rivals(patches, usable, centres_px, rejected, half_widths)
+    apart = usable.copy()
+    _leave_to_rivals(patches, apart, centres_px, centres_px, half_widths)
+    return patches, apart
+
+
+def _leave_to_rivals(
+    patches: Patches, usable: Array, centres_px: Array, rivals_px: Array, half_widths: NDArray[np.intp]
+) -> None:
+    """Clear ``usable`` (K,) where a patch's pixel is nearer to a rival than to its own centre."""
+    gap = np.hypot(*(centres_px[:, None] - rivals_px).transpose(2, 0, 1))
+    for number, rival in np.argwhere((gap > 0.0) & (gap < 3.0 * half_widths[:, None])).tolist():
+        pixels = slice(patches.begins[number], patches.begins[number] + patches.counts[number])
+        # nearer to the spot than to its rival: on the near side of the line half way between them
+        towards = rivals_px[rival] - centres_px[number]
+        middle = (rivals_px[rival] + centres_px[number]) / 2.0
+        along = (patches.u_px[pixels] - middle[0]) * towards[0] + (patches.v_px[pixels] - middle[1]) * towards[1]
+        usable[pixels] *= along <= 0.0
 
 
 def _light_of_others(patches: Patches, parameters: Array, members: NDArray[np.intp], near: NDArray[np.bool_]) -> Array:
@@ -275,21 +304,19 @@ def _chebyshev(places: Array) -> Array:
     return np.asarray(apart)
 
 
-def _without_bad_fits(scene: Scene, blobs: Blobs, fit: Fit) -> NDArray[np.intp]:
-    parameters = fit.parameters
+def _without_bad_fits(sight: Sight, fit: Fit) -> NDArray[np.intp]:
+    parameters, blobs = fit.parameters, sight.blobs
     moved = np.hypot(parameters[:, U] - blobs.u_px, parameters[:, V] - blobs.v_px)
     lost = ~(fit.converged & (moved <= 2.0))
     hot = ~lost & (spot_size_px(parameters) < _HOT_SIZE_PX)
-    for k in np.flatnonzero(lost | hot):
-        scene.reject(blobs.u_px[k], blobs.v_px[k], "no fit" if lost[k] else "hot pixel")
+    for k in np.flatnonzero(lost | hot).tolist():
+        sight.reject(k, "no fit" if lost[k] else "hot pixel")
     keep = np.flatnonzero(~(lost | hot))
     double = np.tril(_chebyshev(parameters[keep, :2]) <= 0.7).any(axis=1)  # two parts that became one
     return np.asarray(keep[~double])
 
 
-def _without_reflections(
-    scene: Scene, blobs: Blobs, fit: Fit, keep: NDArray[np.intp], settings: DetectSettings
-) -> NDArray[np.intp]:
+def _without_reflections(sight: Sight, fit: Fit, keep: NDArray[np.intp], settings: DetectSettings) -> NDArray[np.intp]:
     """Turn down spots that are much weaker than one close by: the shine of that light on the wing."""
     if keep.size < 2:
         return keep
@@ -299,29 +326,9 @@ def _without_reflections(
     apart = np.hypot(*(parameters[:, None, :2] - parameters[None, :, :2]).transpose(2, 0, 1))
     close = apart < settings.reflection_reach_px + settings.reflection_reach_radii * (size[:, None] + size[None, :])
     shine = (close & (flux[:, None] < settings.reflection_flux * flux[None, :])).any(axis=1)
-    for k in keep[shine]:
-        scene.reject(blobs.u_px[k], blobs.v_px[k], "reflection")
+    for k in keep[shine].tolist():
+        sight.reject(k, "reflection")
     return np.asarray(keep[~shine])
-
-
-def _detections(
-    blobs: Blobs,
-    centres_px: Array,
-    covariance_px2: Array,
-    amplitude: Array,
-    saturated: NDArray[np.bool_],
-    rejected: Sequence[Rejected],
-) -> Detections:
-    return Detections(
-        centres_px[:, 0].copy(),
-        centres_px[:, 1].copy(),
-        covariance_px2,
-        amplitude.copy(),
-        blobs.area_px,
-        blobs.circularity,
-        tuple("saturated" if yes else "" for yes in saturated),
-        tuple(rejected),
-    )
 
 
 def _detect_paper(image: Pixels, settings: DetectSettings) -> Detections:

@@ -151,22 +151,24 @@ def sightings(
     found: Sequence[tuple[Detections, Detections]],
     settings: MatchSettings,
 ) -> list[Sighting]:
-    """What ``match_sighting`` needs of frame sets: all of them together, which is faster than one by one."""
+    """What ``match_sighting`` needs of frame sets, at least one: all of them together, which is faster than each."""
+    counts = np.array([[len(one) for one in detections] for detections in found]).T
     through = [
-        _split(
-            rays(
-                camera,
-                np.concatenate([detections[number].pixels for detections in found]),
-                np.concatenate([detections[number].covariance_px2 for detections in found]),
-            ),
-            [len(detections[number]) for detections in found],
+        rays(
+            camera,
+            np.concatenate([detections[number].pixels for detections in found]),
+            np.concatenate([detections[number].covariance_px2 for detections in found]),
         )
         for number, camera in enumerate((side.pair.cam0, side.pair.cam1))
     ]
-    both = list(zip(*through, strict=True))
+    both = list(zip(*(_split(whole, own) for whole, own in zip(through, counts, strict=True)), strict=True))
     if settings.method == "rows":
         return [Sighting(detections, pair, None) for detections, pair in zip(found, both, strict=True)]
-    candidates = _candidates(side_name, side, layout, found, both, settings)
+    noise_px2 = [
+        np.concatenate([np.trace(detections[number].covariance_px2, axis1=1, axis2=2) for detections in found]) / 2.0
+        for number in (0, 1)
+    ]
+    candidates = _candidates(side_name, side, layout, counts, through, noise_px2, settings)
     return [Sighting(*one) for one in zip(found, both, candidates, strict=True)]
 
 
@@ -213,7 +215,7 @@ def _points(candidates: _Candidates, chosen: Indices) -> Points:
     return Points(xyz_m, covariance_m2, candidates.epipolar_px[chosen], ("",) * len(chosen))
 
 
-def _split(whole: Rays, counts: Sequence[int]) -> list[Rays]:
+def _split(whole: Rays, counts: Indices) -> list[Rays]:
     ends = np.cumsum(counts).tolist()
     return [whole[slice(begin, end)] for begin, end in pairwise([0, *ends])]
 
@@ -235,45 +237,45 @@ def _candidates(
     side_name: str,
     side: RigSide,
     layout: MarkerLayout,
-    found: Sequence[tuple[Detections, Detections]],
-    through: Sequence[tuple[Rays, Rays]],
+    counts: Indices,
+    through: Sequence[Rays],
+    noise_px2: Sequence[Array],
     settings: MatchSettings,
 ) -> list[_Candidates]:
-    """Of each set: spots on each other's epipolar lines that meet in front of the cameras, where a wing can be."""
-    pairs, distances_px, d2s = [], [], []
-    for detections, (rays0, rays1) in zip(found, through, strict=True):
-        distance_px = epipolar_distance_px(side.pair, rays0.xy[:, None, :], rays1.xy[None, :, :])
-        noise0, noise1 = (np.trace(d.covariance_px2, axis1=1, axis2=2) / 2.0 for d in detections)
-        variance = (noise0[:, None] + noise1[None, :]) / 2.0 + settings.epipolar_allowance_px**2
-        d2 = distance_px**2 / variance
-        spots = np.nonzero(d2 < settings.epipolar_gate**2)
-        pairs.append(spots)
-        distances_px.append(distance_px[spots])
-        d2s.append(d2[spots])
-    points = triangulate_rays(
-        side, *(Rays.join([one[k][spots[k]] for one, spots in zip(through, pairs, strict=True)]) for k in (0, 1))
-    )
+    """Of each set: spots on each other's epipolar lines that meet in front of the cameras, where a wing can be.
+
+    ``counts`` (2, S) are the spots of each set, of which cam0's and cam1's lie end to end.
+    """
+    of_set, spot0, spot1 = _pairs(counts)
+    first0, first1 = np.cumsum(counts, axis=1) - counts
+    at0, at1 = first0[of_set] + spot0, first1[of_set] + spot1
+    distance_px = epipolar_distance_px(side.pair, through[0].xy[at0], through[1].xy[at1])
+    d2 = distance_px**2 / ((noise_px2[0][at0] + noise_px2[1][at1]) / 2.0 + settings.epipolar_allowance_px**2)
+    near = np.flatnonzero(d2 < settings.epipolar_gate**2)
+    points = triangulate_rays(side, through[0][at0[near]], through[1][at1[near]])
     outboard_m = points.xyz_m[:, 1] * (1.0 if side_name == "right" else -1.0)
     reach_m = 1.1 * layout.pairs_station_m[-1] + 0.2
     with np.errstate(invalid="ignore"):
         inside = (np.linalg.norm(points.xyz_m, axis=1) < reach_m) & (outboard_m > -0.1)
-    candidates = []
-    begin = 0
-    for (spot0, spot1), distance, distance2 in zip(pairs, distances_px, d2s, strict=True):
-        own = slice(begin, begin + len(spot0))
-        begin += len(spot0)
-        good = inside[own]
-        candidates.append(
-            _Candidates(
-                spot0[good],
-                spot1[good],
-                points.xyz_m[own][good],
-                points.covariance_m2[own][good],
-                distance[good],
-                distance2[good],
-            )
-        )
-    return candidates
+    near = near[inside]
+    columns = (
+        spot0[near],
+        spot1[near],
+        points.xyz_m[inside],
+        points.covariance_m2[inside],
+        distance_px[near],
+        d2[near],
+    )
+    ends = np.searchsorted(of_set[near], np.arange(counts.shape[1] + 1)).tolist()
+    return [_Candidates(*(column[begin:end] for column in columns)) for begin, end in pairwise(ends)]
+
+
+def _pairs(counts: Indices) -> tuple[Indices, Indices, Indices]:
+    """All pairs of spots of sets with ``counts`` (2, S): of which set, cam0's, cam1's."""
+    pairs = counts[0] * counts[1]
+    of_set = np.repeat(np.arange(counts.shape[1]), pairs)
+    number = np.arange(len(of_set)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
+    return of_set, *np.divmod(number, counts[1][of_set])
 
 
 def _start(wing: BentWing, candidates: _Candidates, settings: MatchSettings) -> _Result:
@@ -331,9 +333,13 @@ def _assigned(
     wing: BentWing, candidates: _Candidates, places: Array, sigma_m: Sequence[float], none_cost: float
 ) -> tuple[Indices, Array]:
     """(M,) candidate of each marker and the costs (M, C); every spot is used at most once in each image."""
-    apart = candidates.xyz_m[None, :, :] - places[:, None, :]
-    scaled = np.einsum("mij,mcj->mci", wing.directions(places), apart) / np.asarray(sigma_m)
-    cost = np.sum(scaled**2, axis=2) + candidates.epipolar_d2
+    apart = candidates.xyz_m - places[:, None, :]
+    scaled = apart @ (wing.directions(places) / np.asarray(sigma_m)[:, None]).transpose(0, 2, 1)
+    cost = np.einsum("mci,mci->mc", scaled, scaled)
+    cost += candidates.epipolar_d2
+    chosen = _nearest(candidates, cost, none_cost)
+    if chosen is not None:
+        return chosen, cost
     chosen = np.full(wing.count, UNSEEN, dtype=np.intp)
     worth = np.flatnonzero((cost < none_cost).any(axis=0))
     allowed = np.ones(len(worth), dtype=bool)
@@ -353,6 +359,19 @@ def _assigned(
         if chosen[marker] != UNSEEN and rivals:
             chosen[marker] = UNSEEN
     return chosen, cost
+
+
+def _nearest(candidates: _Candidates, cost: Array, none_cost: float) -> Indices | None:
+    """The assignment, when each marker's cheapest candidate is nobody else's: none can be better."""
+    if not cost.shape[1]:
+        return np.full(len(cost), UNSEEN, dtype=np.intp)
+    best = cost.argmin(axis=1)
+    near = cost[np.arange(len(cost)), best] < none_cost
+    taken = best[near]
+    for spots in (candidates.spot0[taken], candidates.spot1[taken]):
+        if spots.size and np.bincount(spots).max() > 1:
+            return None
+    return np.where(near, best, UNSEEN)
 
 
 def _conflict(candidates: _Candidates, chosen: Indices, cost: Array) -> int:
@@ -392,15 +411,12 @@ def _margins(candidates: _Candidates, chosen: Indices, cost: Array, none_cost: f
     swap = swapped + swapped.T - own[:, None] - own[None, :]
     np.fill_diagonal(swap, np.inf)
     taken = candidates.spot0[chosen[seen]], candidates.spot1[chosen[seen]]
-    # (seen, C): whether another marker has the candidate's spot in either image
-    rivals = (taken[0][:, None] == candidates.spot0[None, :]).astype(np.intp)
-    rivals += taken[1][:, None] == candidates.spot1[None, :]
-    anybody = rivals.sum(axis=0)
-    for k, marker in enumerate(seen):
-        free = anybody == rivals[k]
-        free[chosen[marker]] = False
-        best_free = cost[marker, free].min(initial=np.inf) - own[k]
-        margin[marker] = min(best_free, swap[k].min(initial=np.inf), none_cost - own[k])
+    # (seen, C): which of them have the candidate's spot in either image
+    rivals = (taken[0][:, None] == candidates.spot0) | (taken[1][:, None] == candidates.spot1)
+    free = np.where(rivals.sum(axis=0) == rivals, cost[seen], np.inf)
+    free[np.arange(len(seen)), chosen[seen]] = np.inf
+    best = np.minimum(free.min(axis=1, initial=np.inf), swap.min(axis=1, initial=np.inf) + own)
+    margin[seen] = np.minimum(best, none_cost) - own
     return margin
 
 

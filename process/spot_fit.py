@@ -7,13 +7,14 @@ The profile is a Fermi function of the elliptic distance squared, scaled to 1 at
 which is a Gaussian for k = 0 and a disc with a soft edge at t = k for large k: it follows a blurred disc closely at the
 price of one exponential a pixel. A prior keeps the ellipse near a circle where a spot is too small to tell, and holds k
 where it is not determined. A spot is b + A f(t). Weights are the inverse variances of the
-sensor, σ_b² + g A f: background noise and shot noise (g grey levels an electron). All spots are fitted together, by
-Levenberg–Marquardt on their pixels laid end to end.
+sensor, σ_b² + g A f: background noise and shot noise (g grey levels an electron). Spots are fitted together, by
+Levenberg–Marquardt on their pixels laid end to end, some hundred at a time.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,8 @@ _LARGEST_T = 80.0  # exp(80) is far beyond every edge, and finite
 _SHAPE_WEIGHT = 25.0  # 1/σ² of the ellipse's (a − c)/(a + c) and 2d/(a + c) about zero: σ = 0.2
 _EDGE_WEIGHT = 1e-2  # 1/σ² of k about its start
 _EYE = np.eye(PARAMETERS)
+_PORTION_PX = 8192  # fitted together: what they need stays in a core's own cache
+_WORTH_KEEPING = 0.6  # share of spots that are not settled below which the others' pixels are dropped
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +48,8 @@ class Patches:
     """(K,) rows"""
     values: Array
     """(K,) grey levels"""
+    usable: Array
+    """(K,) 1; 0 for pixels that are not to be used"""
     counts: NDArray[np.intp]
     """(N,) pixels of each spot, none zero"""
     background_sigma: Array
@@ -54,27 +59,54 @@ class Patches:
     saturation: float
     """grey level from which a value only says "at least this much" """
 
-    @cached_property
-    def background_variance(self) -> Array:
-        """(K,) of each pixel, but for the light."""
-        return self.spread(self.background_sigma**2)
-
     def spread(self, per_spot: Array) -> Array:
         """Values (..., N) of the spots to their pixels (..., K)."""
         return np.repeat(per_spot, self.counts, axis=-1)
 
     def sums(self, per_pixel: Array) -> Array:
         """Sums (..., N) of values (..., K) over each spot."""
-        return np.asarray(np.add.reduceat(per_pixel, np.cumsum(self.counts) - self.counts, axis=-1))
+        return np.asarray(np.add.reduceat(per_pixel, self.begins, axis=-1))
 
-    def __getitem__(self, chosen: NDArray[np.bool_]) -> "Patches":
-        """The patches of some spots (N,)."""
-        pixels = np.repeat(chosen, self.counts)
+    def variance(self, light: Array) -> Array:
+        """(K,) of each pixel, with so much ``light``."""
+        return self._background_variance + self.shot_gain * np.maximum(light, 0.0)
+
+    @cached_property
+    def begins(self) -> NDArray[np.intp]:
+        """(N,) each spot's first pixel."""
+        return np.cumsum(self.counts) - self.counts
+
+    @cached_property
+    def alike(self) -> list[tuple[slice, slice]]:
+        """Spots in turn that have equally many pixels, and those pixels."""
+        edges = [0, *(np.flatnonzero(np.diff(self.counts)) + 1).tolist(), len(self.counts)]
+        ends = np.append(self.begins, len(self.values)).tolist()
+        return [(slice(first, last), slice(ends[first], ends[last])) for first, last in pairwise(edges)]
+
+    @cached_property
+    def saturated(self) -> NDArray[np.bool_] | None:
+        """(K,); None if none is."""
+        saturated = self.values >= self.saturation
+        return saturated if saturated.any() else None
+
+    @cached_property
+    def _background_variance(self) -> Array:
+        return self.spread(self.background_sigma**2)
+
+    def pixels(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> NDArray[np.intp]:
+        """Places in (K,) of some spots' pixels."""
+        counts = self.counts[chosen]
+        return np.repeat(self.begins[chosen] - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+
+    def __getitem__(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Patches":
+        """The patches of some spots, by mask or number."""
+        pixels = self.pixels(chosen)
         return replace(
             self,
             u_px=self.u_px[pixels],
             v_px=self.v_px[pixels],
             values=self.values[pixels],
+            usable=self.usable[pixels],
             counts=self.counts[chosen],
             background_sigma=self.background_sigma[chosen],
         )
@@ -84,7 +116,7 @@ class Patches:
         """The patches of several images, at least one, in their order."""
         arrays = {
             name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("u_px", "v_px", "values", "counts", "background_sigma")
+            for name in ("u_px", "v_px", "values", "usable", "counts", "background_sigma")
         }
         return cls(**arrays, shot_gain=parts[0].shot_gain, saturation=parts[0].saturation)
 
@@ -108,16 +140,25 @@ class Fit:
 
 
 @dataclass(eq=False)
-class _Evaluation:
-    """The model at some parameters."""
+class _Equations:
+    """Least squares about some parameters."""
 
-    light: Array  # (K,) A f
-    jacobian: Array  # (9, K): by the parameters, and the residual
-    chi2: Array  # (N,)
+    sums: Array  # (N, 9, 9) of weighted products of the model's slopes by the parameters, and of the residual
 
-    def of(self, spots: NDArray[np.bool_], pixels: NDArray[np.bool_]) -> "_Evaluation":
-        """Of some spots (N,), and their pixels (K,)."""
-        return _Evaluation(self.light[pixels], self.jacobian[:, pixels], self.chi2[spots])
+    @property
+    def information(self) -> Array:
+        """(N, 8, 8) Fisher's."""
+        return self.sums[:, :PARAMETERS, :PARAMETERS]
+
+    @property
+    def gradient(self) -> Array:
+        """(N, 8)"""
+        return self.sums[:, :PARAMETERS, PARAMETERS]
+
+    @property
+    def chi2(self) -> Array:
+        """(N,)"""
+        return self.sums[:, PARAMETERS, PARAMETERS]
 
 
 def spot_light(parameters: Array, u_px: Array, v_px: Array) -> Array:
@@ -146,7 +187,7 @@ def start_shape(patches: Patches, start: Array, area_px: Array) -> tuple[Array, 
     Discs of radius R under a Gaussian blur s are fitted best with k = R/s − 1.8, or by a Gaussian if that is negative.
     """
     amplitude, background = start[:, AMPLITUDE], start[:, BACKGROUND]
-    size2 = patches.sums(patches.values - patches.spread(background)) / (np.pi * amplitude)
+    size2 = patches.sums(patches.usable * (patches.values - patches.spread(background))) / (np.pi * amplitude)
     size2 = np.clip(size2, 0.3 * area_px / np.pi, 2.0 * area_px / np.pi + 1.0)
     edge = np.clip(np.sqrt(size2) / USUAL_BLUR_PX - 1.8, 0.1, 20.0)
     return np.asarray(_content(edge) / size2), edge
@@ -159,145 +200,151 @@ def fit_spots(patches: Patches, start: Array, others: Array | None = None) -> Fi
     while the model is below saturation. Spots that do not converge say so; nothing is raised. A spot's fit does not
     depend on which others are fitted with it.
     """
-    others = np.zeros(len(patches.values)) if others is None else others
     fitted = Fit(start.copy(), np.full((len(start), 2, 2), np.nan), np.full(len(start), np.nan), start[:, 0] < -np.inf)
-    left = np.arange(len(start))  # the spots that are not settled yet: others no longer take part
+    order = np.argsort(patches.counts, kind="stable")
+    portion = np.cumsum(patches.counts[order]) // _PORTION_PX
+    for members in np.split(order, np.flatnonzero(np.diff(portion)) + 1):
+        own = patches[members]
+        light = np.zeros(len(own.values)) if others is None else others[patches.pixels(members)]
+        _fit_portion(fitted, members, own, start[members], light)
+    return fitted
+
+
+def _fit_portion(fitted: Fit, spots: NDArray[np.intp], patches: Patches, start: Array, others: Array) -> None:
+    """Fill in what is ``fitted`` to some spots."""
     parameters = start.copy()
     prior = _prior(start)
-    kept = np.ones(len(patches.values))
-    here = _evaluate(patches, parameters, others)
-    weights = _weights(patches, here.light, others, kept)
-    here.chi2 = _chi2(patches, here, weights)
+    slopes, light = _evaluate(patches, parameters, others)
+    kept = patches.usable
+    weights = kept / patches.variance(light + others)
+    here = _equations(patches, slopes, weights)
     damping = np.full(len(start), 1e-3)
     moved = np.full(len(start), np.inf)
+    open_ = np.ones(len(start), dtype=bool)  # spots that are not settled yet
+    at_best = True
     for iteration in range(ITERATIONS):
         if iteration == REWEIGHTED_AT:  # by now the model is a better guess of the pixels' variance than the start was
-            kept = _own_light(patches, parameters, here, others)
-            weights = _weights(patches, here.light, others, kept)
-            here.chi2 = _chi2(patches, here, weights)
-        information, gradient = _normal_equations(patches, here, weights)
-        information += prior
-        gradient -= (prior @ (parameters - start)[:, :, None])[:, :, 0]
+            if not at_best:
+                slopes, light = _evaluate(patches, parameters, others)
+            kept = _own_light(patches, parameters, slopes[PARAMETERS], light, others)
+            weights = kept / patches.variance(light + others)
+            here = _equations(patches, slopes, weights)
+        pull = _times(prior, parameters - start)
+        information = here.information + prior
         ridge = (_diagonal(information) * damping[:, None] + 1e-12)[:, None, :] * _EYE
-        trial = _bounded(parameters + np.linalg.solve(information + ridge, gradient[:, :, None])[:, :, 0], parameters)
-        there = _evaluate(patches, trial, others)
-        there.chi2 = _chi2(patches, there, weights)
+        step = np.linalg.solve(information + ridge, (here.gradient - pull)[:, :, None])[:, :, 0]
+        trial = _bounded(parameters + step, parameters)
+        slopes, light = _evaluate(patches, trial, others)
+        there = _equations(patches, slopes, weights)
         drop = here.chi2 + _pull(prior, parameters - start) - there.chi2 - _pull(prior, trial - start)
         better = drop >= -1e-9 * here.chi2
         moved = np.where(better, np.abs(trial - parameters)[:, :2].max(axis=1), moved)
         settled = (moved < CONVERGED_PX) & (np.abs(drop) < SETTLED_CHI2)
-        if better.all():
+        at_best = bool(better.all())
+        if at_best:
             parameters, here = trial, there
         else:
             parameters = np.where(better[:, None], trial, parameters)
-            here = _chosen(patches, better, there, here)
+            here = _Equations(np.where(better[:, None, None], there.sums, here.sums))
         damping = np.clip(np.where(better, damping * 0.1, damping * 30.0), 1e-6, 1e6)
         if iteration < REWEIGHTED_AT:
             continue
-        if iteration == ITERATIONS - 1:
-            settled[:] = True
-        if settled.any():
-            pixels = np.repeat(settled, patches.counts)
-            own = patches[settled], parameters[settled], here.of(settled, pixels), weights[pixels]
-            _finish(fitted, left[settled], *own, prior[settled], moved[settled])
-            if settled.all():
-                break
-            stay, pixels = ~settled, ~pixels
-            patches, here = patches[stay], here.of(stay, pixels)
-            others, kept, weights = others[pixels], kept[pixels], weights[pixels]
-            left, start, parameters, prior = left[stay], start[stay], parameters[stay], prior[stay]
-            damping, moved = damping[stay], moved[stay]
-    return fitted
+        done = open_ & (settled | (iteration == ITERATIONS - 1))
+        if done.any():
+            pixels = patches.sums((kept > 0).astype(np.float64))
+            _finish(fitted, spots, done, parameters, here, prior, pixels, moved)
+            open_ &= ~done
+            left = np.count_nonzero(open_)
+            if not left:
+                return
+            if left < _WORTH_KEEPING * len(open_):
+                own = patches.pixels(open_)
+                others, kept, weights = others[own], kept[own], weights[own]
+                patches, here = patches[open_], _Equations(here.sums[open_])
+                spots, start, parameters, prior = spots[open_], start[open_], parameters[open_], prior[open_]
+                damping, moved, open_ = damping[open_], moved[open_], open_[open_]
 
 
 def _finish(
     fitted: Fit,
     spots: NDArray[np.intp],
-    patches: Patches,
+    done: NDArray[np.bool_],
     parameters: Array,
-    here: _Evaluation,
-    weights: Array,
+    here: _Equations,
     prior: Array,
+    pixels: Array,
     moved: Array,
 ) -> None:
-    """Fill in what was ``fitted`` to some spots."""
-    information, _ = _normal_equations(patches, here, weights)
-    information += prior
+    """Fill in what was ``fitted`` to the ``done`` ones of some spots, which have so many ``pixels``."""
+    parameters = parameters[done]
+    information = here.information[done] + prior[done]
     ridge = (1e-9 * _diagonal(information) + 1e-12)[:, None, :] * _EYE
     covariance = np.asarray(np.linalg.inv(information + ridge)[:, :2, :2], np.float64)
-    dof = np.maximum(patches.sums((weights > 0).astype(np.float64)) - PARAMETERS, 1.0)
-    chi2_per_dof = here.chi2 / dof
+    chi2_per_dof = here.chi2[done] / np.maximum(pixels[done] - PARAMETERS, 1.0)
     covariance = covariance * np.maximum(chi2_per_dof, LEAST_CHI2)[:, None, None]
     finite = np.isfinite(parameters).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    fitted.parameters[spots] = parameters
-    fitted.covariance_px2[spots] = covariance
-    fitted.chi2_per_dof[spots] = chi2_per_dof
-    fitted.converged[spots] = finite & (moved < 10 * CONVERGED_PX)
+    own = spots[done]
+    fitted.parameters[own] = parameters
+    fitted.covariance_px2[own] = covariance
+    fitted.chi2_per_dof[own] = chi2_per_dof
+    fitted.converged[own] = finite & (moved[done] < 10 * CONVERGED_PX)
 
 
-def _evaluate(patches: Patches, parameters: Array, others: Array) -> _Evaluation:
+def _evaluate(patches: Patches, parameters: Array, others: Array) -> tuple[Array, Array]:
+    """The model's slopes by the parameters, and the residual (9, K), and the spots' own light A f (K,)."""
     table = parameters.T.copy()
     table[EDGE] = np.expm1(table[EDGE])
     u, v, amplitude, background, uu, vv, uv, beta = patches.spread(table)
-    du, dv = patches.u_px - u, patches.v_px - v
-    towards_u, towards_v = uu * du + uv * dv, vv * dv + uv * du
-    rise = np.exp(np.minimum(du * towards_u + dv * towards_v, _LARGEST_T))
+    slopes = np.empty((PARAMETERS + 1, len(u)))
+    du, dv = np.subtract(patches.u_px, u, out=u), np.subtract(patches.v_px, v, out=v)
+    towards_u, towards_v = uu * du, vv * dv
+    towards_u += uv * dv
+    towards_v += uv * du
+    rise = du * towards_u
+    rise += dv * towards_v
+    np.exp(np.minimum(rise, _LARGEST_T, out=rise), out=rise)
     below = 1.0 / (beta + rise)
-    profile = (1.0 + beta) * below
+    beta += 1.0
+    profile = np.multiply(beta, below, out=slopes[AMPLITUDE])
     light = amplitude * profile
-    fall = light * rise * below  # −A f'(t)
-    jacobian = np.empty((PARAMETERS + 1, len(du)))
-    np.multiply(2.0 * fall, towards_u, out=jacobian[U])
-    np.multiply(2.0 * fall, towards_v, out=jacobian[V])
-    jacobian[AMPLITUDE] = profile
-    jacobian[BACKGROUND] = 1.0
-    np.multiply(-fall * du, du, out=jacobian[CURVE_UU])
-    np.multiply(-fall * dv, dv, out=jacobian[CURVE_VV])
-    np.multiply(-2.0 * fall * du, dv, out=jacobian[CURVE_UV])
-    np.multiply(light, 1.0 - profile, out=jacobian[EDGE])
-    residual = patches.values - background - light - others
-    # a saturated pixel has nothing to say once the model is beyond it
-    residual[(patches.values >= patches.saturation) & (residual < 0.0)] = 0.0
-    jacobian[PARAMETERS] = residual
-    return _Evaluation(light, jacobian, np.empty(0))
+    rise *= below
+    fall = np.multiply(light, rise, out=rise)  # −A f'(t)
+    towards_u *= 2.0
+    towards_v *= 2.0
+    np.multiply(fall, towards_u, out=slopes[U])
+    np.multiply(fall, towards_v, out=slopes[V])
+    slopes[BACKGROUND] = 1.0
+    fall_u, fall_v = np.multiply(fall, du, out=towards_u), np.multiply(fall, dv, out=towards_v)
+    np.multiply(fall_u, -du, out=slopes[CURVE_UU])
+    np.multiply(fall_v, -dv, out=slopes[CURVE_VV])
+    np.multiply(fall_u, -2.0 * dv, out=slopes[CURVE_UV])
+    np.multiply(light, 1.0 - profile, out=slopes[EDGE])
+    residual = np.subtract(patches.values, background, out=slopes[PARAMETERS])
+    residual -= light
+    residual -= others
+    if patches.saturated is not None:  # such a pixel has nothing to say once the model is beyond it
+        residual[patches.saturated & (residual < 0.0)] = 0.0
+    return slopes, light
 
 
-def _chosen(patches: Patches, better: NDArray[np.bool_], there: _Evaluation, here: _Evaluation) -> _Evaluation:
-    """``there`` for the spots that are better off there, ``here`` for the others."""
-    go = np.repeat(better, patches.counts)
-    jacobian = np.where(go, there.jacobian, here.jacobian)
-    return _Evaluation(np.where(go, there.light, here.light), jacobian, np.where(better, there.chi2, here.chi2))
+def _equations(patches: Patches, slopes: Array, weights: Array) -> _Equations:
+    """Of weighted least squares; saturated pixels that the model saturates carry nothing."""
+    if patches.saturated is not None:
+        weights = np.where(patches.saturated & (slopes[PARAMETERS] == 0.0), 0.0, weights)
+    weighted = slopes * weights
+    sums = np.empty((len(patches.counts), PARAMETERS + 1, PARAMETERS + 1))
+    for spots, pixels in patches.alike:
+        shape = (PARAMETERS + 1, spots.stop - spots.start, -1)
+        left, right = weighted[:, pixels].reshape(shape), slopes[:, pixels].reshape(shape)
+        np.matmul(left.transpose(1, 0, 2), right.transpose(1, 2, 0), out=sums[spots])
+    return _Equations(sums)
 
 
-def _weights(patches: Patches, light: Array, others: Array, kept: Array) -> Array:
-    """Inverse variances (K,); 0 for pixels that are not to be used."""
-    return kept / (patches.background_variance + patches.shot_gain * np.maximum(light + others, 0.0))
-
-
-def _chi2(patches: Patches, there: _Evaluation, weights: Array) -> Array:
-    residual = there.jacobian[PARAMETERS]
-    return patches.sums(residual * residual * weights)
-
-
-def _own_light(patches: Patches, parameters: Array, here: _Evaluation, others: Array) -> Array:
-    """(K,) 0 for pixels beside the spot that are 3 σ brighter than it makes them: shine too faint to be a spot."""
-    variance = patches.background_variance + patches.shot_gain * np.maximum(here.light + others, 0.0)
-    beside = here.light < 0.25 * patches.spread(parameters[:, AMPLITUDE])
-    foreign = beside & (here.jacobian[PARAMETERS] > 3.0 * np.sqrt(variance))
-    return np.asarray(1.0 - foreign, np.float64)
-
-
-def _normal_equations(patches: Patches, here: _Evaluation, weights: Array) -> tuple[Array, Array]:
-    """Fisher information (N, 8, 8) and gradient (N, 8); saturated pixels that the model saturates carry none."""
-    censored = (patches.values >= patches.saturation) & (here.jacobian[PARAMETERS] == 0.0)
-    weighted = here.jacobian[:PARAMETERS] * np.where(censored, 0.0, weights)
-    both = np.empty((len(patches.counts), PARAMETERS, PARAMETERS + 1))
-    begin = 0
-    for spot, count in enumerate(patches.counts.tolist()):
-        own = slice(begin, begin + count)
-        np.matmul(weighted[:, own], here.jacobian[:, own].T, out=both[spot])
-        begin += count
-    return both[:, :, :PARAMETERS].copy(), both[:, :, PARAMETERS].copy()
+def _own_light(patches: Patches, parameters: Array, residual: Array, light: Array, others: Array) -> Array:
+    """(K,) usable pixels but those beside the spot that are 3 σ brighter than it makes them: faint shine."""
+    beside = light < 0.25 * patches.spread(parameters[:, AMPLITUDE])
+    foreign = beside & (residual > 3.0 * np.sqrt(patches.variance(light + others)))
+    return np.where(foreign, 0.0, patches.usable)
 
 
 def _prior(start: Array) -> Array:
@@ -313,7 +360,11 @@ def _prior(start: Array) -> Array:
 
 
 def _pull(prior: Array, change: Array) -> Array:
-    return np.asarray(np.sum((prior @ change[:, :, None])[:, :, 0] * change, axis=1))
+    return np.asarray(np.sum(_times(prior, change) * change, axis=1))
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
 
 
 def _diagonal(matrices: Array) -> Array:

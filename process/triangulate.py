@@ -19,6 +19,7 @@ Method = Literal["default", "linear", "paper"]
 GAUSS_NEWTON_STEPS = 3
 """From a linear start a centroid's error away from the optimum each step squares what is left: 2 are enough."""
 LEAST_PARALLAX = 1e-6  # sine of the angle between rays that counts as parallel
+_SINGULAR = 1e-16  # determinant over the cube of the trace, where rounding has eaten it up
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,16 @@ class Points:
     """(N,) signed (Sampson) distance from the epipolar condition"""
     reasons: tuple[str, ...]
     """empty, ``parallel``, ``behind`` or ``outside_lens``"""
+
+    @classmethod
+    def join(cls, parts: Sequence["Points"]) -> "Points":
+        """Those of all ``parts``, at least one, in their order."""
+        return cls(
+            np.concatenate([part.xyz_m for part in parts]),
+            np.concatenate([part.covariance_m2 for part in parts]),
+            np.concatenate([part.epipolar_px for part in parts]),
+            tuple(reason for part in parts for reason in part.reasons),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +115,8 @@ def triangulate_rays(side: RigSide, rays0: Rays, rays1: Rays) -> Points:
         weight0, weight1 = (_inverse_or_identity(r.covariance) for r in (rays0, rays1))
         for _ in range(GAUSS_NEWTON_STEPS):
             information, gradient = _normal_equations(R, t, points, rays0.xy, rays1.xy, weight0, weight1)
-            points = points + _solve(information, gradient)
+            step = np.einsum("nij,nj->ni", _inverse_or_nan(information), gradient)
+            points = points + np.where(_finite(step)[:, None], step, 0.0)
         information, _ = _normal_equations(R, t, points, rays0.xy, rays1.xy, weight0, weight1)
         covariance = _inverse_or_nan(information)
     epipolar_px = epipolar_distance_px(side.pair, rays0.xy, rays1.xy)
@@ -210,10 +222,7 @@ def _normal_equations(
     for rotation, shift, xy, weight in ((np.eye(3), np.zeros(3), xy0, weight0), (R, t, xy1, weight1)):
         seen = points @ rotation.T + shift
         projected = seen[:, :2] / seen[:, 2:]
-        by_seen = np.zeros((len(points), 2, 3))
-        by_seen[:, 0, 0] = by_seen[:, 1, 1] = 1.0 / seen[:, 2]
-        by_seen[:, :, 2] = -projected / seen[:, 2:]
-        jacobian = by_seen @ rotation
+        jacobian = (rotation[:2] - projected[:, :, None] * rotation[2]) / seen[:, 2, None, None]
         weighted = jacobian.transpose(0, 2, 1) @ weight
         information += weighted @ jacobian
         gradient += np.einsum("nij,nj->ni", weighted, xy - projected)
@@ -232,24 +241,21 @@ def _in_body(side: RigSide, points: Array, covariance: Array, epipolar_px: Array
 
 
 def _inverse_or_identity(matrices: Array) -> Array:
-    good = _finite(matrices)
-    return np.linalg.inv(np.where(good[:, None, None], matrices, np.eye(matrices.shape[1])))
+    """Of (N, 2, 2); the identity instead of one that is not finite."""
+    a, b, c, d = np.where(_finite(matrices), matrices.reshape(-1, 4).T, np.eye(2).reshape(4, 1))
+    return np.asarray((np.stack([d, -b, -c, a]) / (a * d - b * c)).T.reshape(-1, 2, 2))
 
 
 def _inverse_or_nan(matrices: Array) -> Array:
-    good = _finite(matrices)
-    good[good] = np.linalg.matrix_rank(matrices[good]) == matrices.shape[1]
-    inverse = np.full_like(matrices, np.nan)
-    inverse[good] = np.linalg.inv(matrices[good])
-    return inverse
-
-
-def _solve(information: Array, gradient: Array) -> Array:
-    good = _finite(information) & _finite(gradient)
-    good[good] = np.linalg.det(information[good]) > 0.0
-    step = np.zeros_like(gradient)
-    step[good] = np.linalg.solve(information[good], gradient[good, :, None])[:, :, 0]
-    return step
+    """Of symmetric (N, 3, 3), by cofactors; NaN instead of one that is singular or not finite."""
+    a, b, c, _, d, e, _, _, f = matrices.reshape(-1, 9).T
+    aa, ab, ac = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * aa + b * ab + c * ac
+    size = a + d + f
+    determinant = np.where(determinant > _SINGULAR * size * size * size, determinant, np.nan)
+    bc = b * c - a * e
+    cofactors = np.stack([aa, ab, ac, ab, a * f - c * c, bc, ac, bc, a * d - b * b])
+    return np.asarray((cofactors / determinant).T.reshape(-1, 3, 3))
 
 
 def _finite(stacked: Array) -> NDArray[np.bool_]:

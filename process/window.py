@@ -34,7 +34,7 @@ def windowed_centres(patches: Patches, start: Array) -> Centres:
     """
     sigma = np.maximum(spot_size_px(start) / np.sqrt(2.0), LEAST_SIGMA_PX)
     scale, background = patches.spread(np.stack([-0.5 / sigma**2, start[:, BACKGROUND]]))
-    light = patches.values - background
+    light = patches.usable * (patches.values - background)
     centres = start[:, :2].copy()
     moments = np.empty((3, len(light)))
     step = np.zeros_like(centres)
@@ -48,8 +48,7 @@ def windowed_centres(patches: Patches, start: Array) -> Centres:
         with np.errstate(all="ignore"):  # a patch without light: NaN, which does not count as converged
             step = np.clip(2.0 * np.stack([first_u, first_v], axis=1) / total[:, None], -1.0, 1.0)
         centres += step
-    variance = patches.background_variance + patches.shot_gain * np.maximum(light, 0.0)
-    spread = window * window * variance
+    spread = patches.usable * window * window * patches.variance(light)
     uu, vv, uv = patches.sums(np.stack([spread * du * du, spread * dv * dv, spread * du * dv]))
     covariance = np.empty((len(start), 2, 2))
     with np.errstate(all="ignore"):
