@@ -37,6 +37,8 @@ class ForgetfulDisk:
             self._image = mmap.mmap(file.fileno(), 0)
         self._aside: dict[int, bytes] = {}  # by sector
         self._alive = True
+        self._answers = threading.Event()
+        self._answers.set()
         self._mutex = threading.Lock()
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(str(address))
@@ -60,8 +62,14 @@ class ForgetfulDisk:
                     self.forgotten += 1
             self._aside.clear()
 
+    def hang(self) -> None:
+        """Answer nothing more: whoever in the guest waits for this disk can not even be killed."""
+        self._answers.clear()
+
     def close(self) -> None:
         """End; the image file holds what survived."""
+        self.cut()
+        self._answers.set()
         self._listener.close()
         self._thread.join(10.0)
         self._image.flush()
@@ -106,6 +114,7 @@ class ForgetfulDisk:
         if magic != _REQUEST or kind == _DISCONNECT:
             return False
         data = _read(connection, length) if kind == _WRITE else b""
+        self._answers.wait()
         with self._mutex:
             if not self._alive:
                 return False
