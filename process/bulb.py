@@ -46,7 +46,8 @@ def by_dome(side: RigSide, points_m: Array, normals: Array) -> Array:
     by_point, by_b = slopes.reshape(-1, 4, 3), moved.reshape(-1, 4)
     good = np.isfinite(by_point).all(axis=(1, 2)) & np.isfinite(by_b).all(axis=1)
     response = np.full((len(by_point), 3), np.nan)
-    response[good] = (np.linalg.pinv(by_point[good]) @ by_b[good, :, None])[:, :, 0]
+    transposed = by_point[good].transpose(0, 2, 1)
+    response[good] = np.linalg.solve(transposed @ by_point[good], transposed @ by_b[good, :, None])[:, :, 0]
     return response
 
 

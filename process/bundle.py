@@ -299,23 +299,23 @@ def _camera_jacobian(estimate: Estimate, camera: int) -> tuple[Array, Array, Arr
     """Derivatives of one camera's pixels, (V, N, 2, ·), by all cameras' parameters, the view's pose and the corners."""
     chain = _points(estimate, camera)
     points = chain[-1]
-    by_intrinsics, by_point = _lens_jacobian(points.reshape(-1, 3), estimate.intrinsics[camera])
+    by_intrinsics, by_point = lens_jacobian(points.reshape(-1, 3), estimate.intrinsics[camera])
     by_point = by_point.reshape(*points.shape[:2], 2, 3)
     cameras = len(estimate.intrinsics)
     by_parameters = np.zeros((*points.shape[:2], 2, INTRINSICS * cameras + 6))
     own = slice(INTRINSICS * camera, INTRINSICS * (camera + 1))
     by_parameters[..., own] = by_intrinsics.reshape(*points.shape[:2], 2, INTRINSICS)
     if camera == 1:
-        by_parameters[..., -6:-3] = by_point @ _turn_jacobian(chain[2], estimate.stereo[:3])
+        by_parameters[..., -6:-3] = by_point @ turn_jacobian(chain[2], estimate.stereo[:3])
         by_parameters[..., -3:] = by_point
         by_point = by_point @ rotation_matrix(estimate.stereo[:3])
-    turns = [_turn_jacobian(chain[0][i], view[:3]) for i, view in enumerate(estimate.views)]
+    turns = [turn_jacobian(chain[0][i], view[:3]) for i, view in enumerate(estimate.views)]
     by_view = np.concatenate([by_point @ np.stack(turns), by_point], axis=-1)
     axes = np.stack([rotation_matrix(view[:3]) for view in estimate.views])
     return by_parameters, by_view, by_point @ axes[:, None]
 
 
-def _lens_jacobian(points: Array, intrinsics: Array) -> tuple[Array, Array]:
+def lens_jacobian(points: Array, intrinsics: Array) -> tuple[Array, Array]:
     """Derivatives of the pixels by the intrinsics (M, 2, 9) and by the point in the camera's frame (M, 2, 3)."""
     focal = intrinsics[:2]
     ideal = points[:, :2] / points[:, 2:]
@@ -347,7 +347,7 @@ def cross_matrix(vectors: Array) -> Array:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape, 3)
 
 
-def _turn_jacobian(turned: Array, rotation_rad: Array) -> Array:
+def turn_jacobian(turned: Array, rotation_rad: Array) -> Array:
     """Derivative (…, 3, 3) of R(w) p by the rotation vector w, where ``turned`` (…, 3) is R(w) p.
 
     −[R p]× J, with J the left Jacobian of SO(3) (Barfoot, State Estimation for Robotics, eq. 7.77).

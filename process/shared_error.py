@@ -20,7 +20,7 @@ import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
 from process.bulb import by_light, light_covariance
-from process.bundle import cross_matrix
+from process.bundle import cross_matrix, lens_jacobian, turn_jacobian
 from process.camera_model import PAIR_PARAMETER_NAMES, Light, MarkerLayout, Rig, RigSide, StereoPair
 
 Array = NDArray[np.float64]
@@ -92,25 +92,21 @@ def triangulated_by_calibration(pair: StereoPair, points_cam0: Array) -> Array:
 
     NaN where a point is NaN or not in front of both cameras.
     """
-    by_parameters = np.empty((len(points_cam0), 4, 24))
-    values = pair.parameters
-    for index in range(24):
-        step = 1e-6 * max(1.0, abs(values[index]))
-        shift = np.zeros(24)
-        shift[index] = step
-        ahead, behind = (_pixels(pair.with_parameters(values + sign * shift), points_cam0) for sign in (1, -1))
-        by_parameters[:, :, index] = (ahead - behind) / (2 * step)
-    R = pair.T_cam1_cam0[:3, :3]
-    by_point = np.concatenate(
-        [
-            pair.cam0.project_with_jacobian(points_cam0)[1],
-            pair.cam1.project_with_jacobian(points_cam0 @ R.T + pair.T_cam1_cam0[:3, 3])[1] @ R,
-        ],
-        axis=1,
+    R, t = pair.T_cam1_cam0[:3, :3], pair.T_cam1_cam0[:3, 3]
+    turned = points_cam0 @ R.T
+    slope0, slope1 = (
+        camera.project_with_jacobian(seen)[1] for camera, seen in ((pair.cam0, points_cam0), (pair.cam1, turned + t))
     )
+    by_point = np.concatenate([slope0, slope1 @ R], axis=1)
     good = np.isfinite(by_point).all(axis=(1, 2))
+    parameters, by_parameters = pair.parameters, np.zeros((int(good.sum()), 4, 24))
+    by_parameters[:, :2, :9] = lens_jacobian(points_cam0[good], parameters[:9])[0]
+    by_parameters[:, 2:, 9:18] = lens_jacobian((turned + t)[good], parameters[9:18])[0]
+    by_parameters[:, 2:, 18:21] = slope1[good] @ turn_jacobian(turned[good], parameters[18:21])
+    by_parameters[:, 2:, 21:] = slope1[good]
+    transposed = by_point[good].transpose(0, 2, 1)
     response = np.full((len(points_cam0), 3, 24), np.nan)
-    response[good] = -np.linalg.pinv(by_point[good]) @ by_parameters[good]
+    response[good] = -np.linalg.solve(transposed @ by_point[good], transposed @ by_parameters)
     return response
 
 
@@ -142,8 +138,3 @@ def light_of(table: pa.Table) -> Light:
 def _carried(side: RigSide, jacobian: Array, surface: Surface | None) -> Array:
     covariance = shared_covariance(side, None if surface is None else surface.light)
     return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
-
-
-def _pixels(pair: StereoPair, points_cam0: Array) -> Array:
-    in_cam1 = points_cam0 @ pair.T_cam1_cam0[:3, :3].T + pair.T_cam1_cam0[:3, 3]
-    return np.concatenate([pair.cam0.project(points_cam0), pair.cam1.project(in_cam1)], axis=1)

@@ -8,7 +8,7 @@ Source: W. Su and C. E. S. Cesnik, "Strain-based geometrically nonlinear beam fo
 aircraft", International Journal of Solids and Structures 48 (2011), doi:10.1016/j.ijsolstr.2011.04.012.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -61,7 +61,10 @@ class Beam:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A strained beam, body frame. A strain j moves a point p outboard of it by slide[j] + spin[j] × p."""
+    """A strained beam, body frame. A strain j moves a point p outboard of it by slide[j] + spin[j] × p.
+
+    Of several strained beams every field has their axes in front.
+    """
 
     strain: Array  # (N, 4)
     position_m: Array  # (N + 1, 3) nodes
@@ -71,47 +74,50 @@ class Shape:
     spin: Array  # (4N, 3)
     slide: Array  # (4N, 3)
 
+    def __getitem__(self, at: int) -> "Shape":
+        """One of several."""
+        return Shape(*(getattr(self, member.name)[at] for member in fields(self)))
+
 
 def shape_of(beam: Beam, strain: Array) -> Shape:
-    """The shape of a beam with ``strain`` (N, 4): eqs. 1 to 6, exact for any strain."""
+    """The shape of a beam with ``strain`` (…, N, 4): eqs. 1 to 6, exact for any strain."""
     length = beam.length_m
-    n = len(length)
-    w = (beam.curvature_1pm + strain[:, 1:]) * length[:, None]
-    stretched = (1 + strain[:, 0]) * length
-    c0, c1, c2, c3, c4, c5, _, _ = (c[:, None, None] for c in stumpff(np.sum(w * w, axis=1)))
-    W, outer, eye = hat(w), w[:, :, None] * w[:, None, :], np.eye(3)
+    w = (beam.curvature_1pm + strain[..., 1:]) * length[:, None]
+    stretched = (1 + strain[..., 0]) * length
+    c0, c1, c2, c3, c4, c5, _, _ = (c[..., None, None] for c in stumpff(np.sum(w * w, axis=-1)))
+    W, outer, eye = hat(w), w[..., :, None] * w[..., None, :], np.eye(3)
     V = c1 * eye + c2 * W + c3 * outer  # the left Jacobian of the turn
-    step = np.zeros((n, 4, 4), dtype=w.dtype)
-    step[:, :3, :3] = c0 * eye + c1 * W + c2 * outer
-    step[:, :3, 3] = V[:, :, 0] * stretched[:, None]
-    step[:, 3, 3] = 1
-    step[:, :3] = beam.joint @ step[:, :3]
-    root = np.eye(4)
-    root[:3, :3], root[:3, 3] = beam.R_body_root, beam.root_m
-    frame = _running_product(np.concatenate([root[None].astype(w.dtype), step]))
-    R, r = frame[:, :3, :3], frame[:, :3, 3]
-    R_start = R[:-1] @ beam.joint
+    several, n = w.shape[:-2], len(length)
+    frame = np.zeros((*several, n + 1, 4, 4), dtype=w.dtype)
+    frame[..., 0, :3, :3], frame[..., 0, :3, 3] = beam.R_body_root, beam.root_m
+    frame[..., 1:, :3, :3] = beam.joint @ (c0 * eye + c1 * W + c2 * outer)
+    frame[..., 1:, :3, 3] = (beam.joint @ V[..., :1])[..., 0] * stretched[..., None]
+    frame[..., 3, 3] = 1
+    _multiply_outboard(frame)
+    R, r = frame[..., :3, :3], frame[..., :3, 3]
+    R_start = R[..., :-1, :, :] @ beam.joint
 
     # Columns: how the element's end moves (eq. 5) and turns (eq. 4) with its own four strains, in its starting frame.
     d1, d2, d3 = (c3 - c2) / 2, (2 * c4 - c3) / 2, (3 * c5 - c4) / 2  # derivatives of c1, c2, c3 by |w|²
-    along = d1 * _E1[:, None] + d2 * W[:, :, :1] + d3 * outer[:, :, :1]
-    bend = 2 * along * w[:, None, :] + c2 * _E1_CROSS + c3 * (eye * w[:, :1, None] + w[:, :, None] * _E1)
-    end = np.concatenate([V[:, :, :1], bend * stretched[:, None, None]], axis=2) * length[:, None, None]
-    turn = np.concatenate([np.zeros((n, 3, 1)), V * length[:, None, None]], axis=2)
-    spin = (R_start @ turn).transpose(0, 2, 1)
-    slide = (R_start @ end).transpose(0, 2, 1) - cross(spin, r[1:, None, :])
-    return Shape(strain, r, R, R_start, w, spin.reshape(-1, 3), slide.reshape(-1, 3))
+    along = d1 * _E1[:, None] + d2 * W[..., :1] + d3 * outer[..., :1]
+    bend = 2 * along * w[..., None, :] + c2 * _E1_CROSS + c3 * (eye * w[..., :1, None] + w[..., :, None] * _E1)
+    own = np.zeros((*several, n, 3, 8), dtype=w.dtype)
+    own[..., 1:4] = V * length[:, None, None]
+    own[..., 4:5] = V[..., :1] * length[:, None, None]
+    own[..., 5:] = bend * (stretched * length)[..., None, None]
+    moved = np.swapaxes(R_start @ own, -1, -2)
+    spin = moved[..., :4, :]
+    slide = moved[..., 4:, :] - cross(spin, r[..., 1:, None, :])
+    return Shape(strain, r, R, R_start, w, spin.reshape(*several, -1, 3), slide.reshape(*several, -1, 3))
 
 
 # ∂(w × e1)/∂w: column j is e_j × e1
 _E1_CROSS = -hat(_E1)
 
 
-def _running_product(frame: Array) -> Array:
-    """Products of the first 1, 2, … of ``frame`` (n, 4, 4), by doubling: log₂ n batched steps, no loop."""
-    out = frame.copy()
+def _multiply_outboard(frame: Array) -> None:
+    """Each of ``frame`` (…, n, 4, 4) into the product of all up to it, by doubling: log₂ n batched steps, no loop."""
     reach = 1
-    while reach < len(out):
-        out[reach:] = out[:-reach] @ out[reach:]
+    while reach < frame.shape[-3]:
+        frame[..., reach:, :, :] = frame[..., :-reach, :, :] @ frame[..., reach:, :, :]
         reach *= 2
-    return out

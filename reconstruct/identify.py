@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruct.fit import marker_problem
-from reconstruct.iteration import Problem, linearise
+from reconstruct.iteration import Problem, linearise, node_motion
+from reconstruct.posterior import by_strains
 from reconstruct.rotation import Array, hat
-from reconstruct.wing import HalfWing, twist_gradient
+from reconstruct.wing import HalfWing
 from reconstruct.wing_file import FitSettings
 
 MEASURED = 0.5  # share of the variance that must be the markers' doing for a quantity to count as measured
@@ -96,9 +97,8 @@ def _linear(half: HalfWing, problem: Problem) -> tuple[Array, Array, Array]:
     """Information (u, u), and derivatives by the unknowns of the nodes (N + 1, 3, u) and of twist (N + 1, u)."""
     linear = linearise(problem, np.zeros((half.beam.elements, 4)), np.zeros(problem.unknowns))
     A = linear.jacobian.reshape(-1, problem.unknowns)
-    position = linear.slide + hat(linear.shape.position_m).transpose(0, 2, 1) @ linear.spin
-    twist = (twist_gradient(half, linear.shape.R_body_section)[:, None, :] @ linear.spin)[:, 0, :]
-    return A.T @ A, position, twist
+    moved = by_strains(half, linear.shape, linear.response)
+    return A.T @ A, moved[:, :3], moved[:, 3]
 
 
 def _information_of_pairs(half: HalfWing, problem: Problem, cov: Array, settings: FitSettings) -> Array:
@@ -106,7 +106,7 @@ def _information_of_pairs(half: HalfWing, problem: Problem, cov: Array, settings
     linear = linearise(problem, np.zeros((half.beam.elements, 4)), np.zeros(problem.unknowns))
     node = half.marker_node[0::2]
     apart = half.rest_marker_m[0::2] - half.rest_marker_m[1::2]
-    turns = hat(apart).transpose(0, 2, 1) @ linear.spin[node]
+    turns = -hat(apart) @ node_motion(linear.shape, linear.response, np.arange(len(half.node_s_m)))[node, :3]
     spread = cov[0::2] + cov[1::2] + 2 * settings.marker_model_sigma_m**2 * np.eye(3)
     both = np.isfinite(spread).all(axis=(1, 2))
     whiten = np.linalg.inv(np.linalg.cholesky(spread[both]))

@@ -41,13 +41,11 @@ class Observed:
         known = [member.name for member in fields(cls) if getattr(parts[0], member.name) is not None]
         return cls(**{name: np.concatenate([getattr(one, name) for one in parts]) for name in known})
 
-    def problems(self, half: HalfWing, settings: FitSettings, rig: RigSide | None) -> list[Unscaled]:
+    def problem(self, half: HalfWing, settings: FitSettings, rig: RigSide | None) -> Unscaled:
         """What the fit of each set is to explain; ``rig`` is needed for pixels."""
         if rig is None or self.pixels is None or self.covariance_px2 is None or self.epipolar_px is None:
-            places = zip(self.xyz_m, self.cov_m2, strict=True)
-            return [marker_problem(half, xyz, cov, settings) for xyz, cov in places]
-        seen = zip(self.pixels, self.covariance_px2, self.epipolar_px, strict=True)
-        return [pixel_problem(half, rig, pixels, cov, settings, float(sigma)) for pixels, cov, sigma in seen]
+            return marker_problem(half, self.xyz_m, self.cov_m2, settings)
+        return pixel_problem(half, rig, self.pixels, self.covariance_px2, settings, self.epipolar_px)
 
 
 def observe(series: MarkerSeries, half: HalfWing, rig: RigSide | None, instants: InstantSettings) -> Observed:

@@ -4,11 +4,13 @@ The fit's other way in (direct mode): residuals are pixels, through the camera m
 saw still counts. The marker's place on the wing and the prior are those of the fit to triangulated markers.
 """
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from process.camera_model import RigSide
-from reconstruct.fit import Fit, Unscaled, fit_measured, pose
-from reconstruct.rotation import Array, Mask
+from reconstruct.fit import Fit, Unscaled, fit_each, pose
+from reconstruct.rotation import Array, Index, Mask
 from reconstruct.wing import HalfWing
 from reconstruct.wing_file import FitSettings
 
@@ -41,8 +43,50 @@ def fit_pixels(
         the fit, ``distance`` in sigmas of all that was seen of a marker; ``residual_m`` is NaN, nothing was measured
         in metres. NaN and a reason as in ``fit_frame``; a marker counts when one camera saw it.
     """
-    posed = pixel_problem(half, rig, pixels, covariance_px2, settings, epipolar_px)
-    return fit_measured(posed, settings, start, prior_scale)
+    posed = pixel_problem(half, rig, pixels[None], covariance_px2[None], settings, epipolar_px)
+    return fit_each(posed, settings, prior_scale, start)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Lights' pixels: see ``iteration.Measure``, d is four, (u, v) of cam0 and of cam1."""
+
+    rig: RigSide
+    given: Array  # (…, M, 2, 2) of marker, camera, (u, v); any number where not seen
+    covariance_px2: Array  # (…, M, 2, 2, 2), with what calibration adds where one camera saw a light
+    seen: Mask  # (…, M, 2)
+    epipolar_px: Array  # (…, 1) what it adds where both did
+    model_sigma_m: float
+
+    def __call__(self, point: Array) -> tuple[Array, Array]:
+        """What stands between them and ``point`` (…, M, 3).
+
+        Where a light cannot be (behind a camera), it has no pull for this step.
+        """
+        image, slope = np.zeros(self.given.shape), np.zeros((*self.given.shape, 3))
+        flat = point.reshape(-1, 3)
+        cameras = self.rig.pair.cam0, self.rig.pair.cam1
+        for at, (camera, T) in enumerate(zip(cameras, _cameras_from_body(self.rig), strict=True)):
+            found, by_camera = camera.project_with_jacobian(flat @ T[:3, :3].T + T[:3, 3])
+            image[..., at, :] = found.reshape(*point.shape[:-1], 2)
+            slope[..., at, :, :] = (by_camera @ T[:3, :3]).reshape(*point.shape[:-1], 2, 3)
+        ahead = np.isfinite(image).all(axis=-1) & np.isfinite(slope).all(axis=(-1, -2)) & self.seen
+        error = np.where(ahead[..., None], image - self.given, 0.0).reshape(*point.shape[:-1], 4)
+        slopes = np.where(ahead[..., None, None], slope, 0.0).reshape(*point.shape[:-1], 4, 3)
+        spread = self.model_sigma_m**2 * slopes @ np.swapaxes(slopes, -1, -2)
+        for at in range(_CAMERAS):
+            own = slice(2 * at, 2 * at + 2)
+            spread[..., own, own] += self.covariance_px2[..., at, :, :]
+        both = self.seen.all(axis=-1)
+        across = np.broadcast_to(self.epipolar_px, both.shape)[both] ** 2
+        spread[both] += across[:, None, None] * _across(slopes[both])
+        whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(spread)), dtype=np.float64)
+        return (whiten @ error[..., None])[..., 0], whiten @ slopes
+
+    def __getitem__(self, rows: Index) -> "Seen":
+        """Some of the instants."""
+        own = {name: getattr(self, name)[rows] for name in ("given", "covariance_px2", "seen", "epipolar_px")}
+        return replace(self, **own)
 
 
 def pixel_problem(
@@ -51,43 +95,28 @@ def pixel_problem(
     pixels: Array,
     covariance_px2: Array,
     settings: FitSettings,
-    epipolar_px: float = 0.0,
+    epipolar_px: Array | float = 0.0,
 ) -> Unscaled:
-    """The problem of centroids (M, 2, 2) with covariances (M, 2, 2, 2); raises ValueError for other shapes.
+    """The problem of centroids (…, M, 2, 2) with covariances (…, M, 2, 2, 2); raises ValueError for other shapes.
 
     Calibration makes the cameras disagree on lights by more than centroids' noise. No place of a light explains that,
-    so ``epipolar_px`` widens what is across (both saw it), or half of its variance any direction (one did).
+    so ``epipolar_px``, one for all instants or each, widens what is across (both saw it), or half of its variance any
+    direction (one did).
     """
     markers = len(half.marker_ids)
-    if pixels.shape != (markers, _CAMERAS, 2) or covariance_px2.shape != (markers, _CAMERAS, 2, 2):
+    if pixels.shape[-3:] != (markers, _CAMERAS, 2) or covariance_px2.shape[-4:] != (markers, _CAMERAS, 2, 2):
         raise ValueError(f"expected {markers} markers in 2 cameras, got {pixels.shape} and {covariance_px2.shape}")
-    known = np.concatenate([pixels[..., None], covariance_px2], axis=3)
-    seen: Mask = np.isfinite(known).all(axis=(2, 3))
-    safe = np.where(seen[:, :, None, None], covariance_px2, np.eye(2))
-    seen = np.logical_and(seen, np.linalg.eigvalsh(safe)[:, :, 0] > 0)
-    safe = np.where(seen[:, :, None, None], safe, np.eye(2))
-    given = np.where(seen[:, :, None], pixels, 0.0)
-    body_to_camera = _cameras_from_body(rig)
-    both = seen.all(axis=1)
-    safe = safe + np.where(both, 0.0, epipolar_px**2 / 2)[:, None, None, None] * np.eye(2)
-
-    def measure(point: Array) -> tuple[Array, Array]:
-        """In sigmas: (M, 4) and (M, 4, 3). Where a light cannot be (behind a camera), it has no pull for this step."""
-        image, slope = np.zeros((markers, _CAMERAS, 2)), np.zeros((markers, _CAMERAS, 2, 3))
-        for at, (camera, T) in enumerate(zip((rig.pair.cam0, rig.pair.cam1), body_to_camera, strict=True)):
-            image[:, at], by_camera = camera.project_with_jacobian(point @ T[:3, :3].T + T[:3, 3])
-            slope[:, at] = by_camera @ T[:3, :3]
-        ahead = np.isfinite(image).all(axis=2) & np.isfinite(slope).all(axis=(2, 3)) & seen
-        error = np.where(ahead[:, :, None], image - given, 0.0).reshape(markers, 4)
-        slopes = np.where(ahead[:, :, None, None], slope, 0.0).reshape(markers, 4, 3)
-        spread = settings.marker_model_sigma_m**2 * slopes @ slopes.transpose(0, 2, 1)
-        for at in range(_CAMERAS):
-            spread[:, 2 * at : 2 * at + 2, 2 * at : 2 * at + 2] += safe[:, at]
-        spread[both] += epipolar_px**2 * _across(slopes[both])
-        whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(spread)), dtype=np.float64)
-        return (whiten @ error[:, :, None])[:, :, 0], whiten @ slopes
-
-    numbers: Array = 2.0 * seen.sum(axis=1)
+    known = np.concatenate([pixels[..., None], covariance_px2], axis=-1)
+    seen: Mask = np.isfinite(known).all(axis=(-1, -2))
+    safe = np.where(seen[..., None, None], covariance_px2, np.eye(2))
+    seen = np.logical_and(seen, np.linalg.eigvalsh(safe)[..., 0] > 0)
+    safe = np.where(seen[..., None, None], safe, np.eye(2))
+    given = np.where(seen[..., None], pixels, 0.0)
+    sigma = np.broadcast_to(np.asarray(epipolar_px, dtype=np.float64), pixels.shape[:-3])[..., None]
+    alone = np.where(seen.all(axis=-1), 0.0, sigma**2 / 2)
+    safe = safe + alone[..., None, None, None] * np.eye(2)
+    numbers: Array = 2.0 * seen.sum(axis=-1)
+    measure = Seen(rig, given, safe, seen, sigma, settings.marker_model_sigma_m)
     return pose(half, settings, measure, numbers > 0, numbers)
 
 

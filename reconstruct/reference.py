@@ -1,6 +1,5 @@
 """A recorded window, another result, or the unloaded wing → the shape that displacements and twist are counted from."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,22 +45,21 @@ def unloaded(half: HalfWing) -> ReferenceShape:
 
 
 def mean_of(
-    name: str, half: HalfWing, fits: Iterable[Fit], shared: SharedError | None, *, same: bool = True
+    name: str, half: HalfWing, fits: Fit | None, shared: SharedError | None, *, same: bool = True
 ) -> ReferenceShape | None:
     """The mean of the fits that converged, its noise smaller by the root of their number; None where there is none.
 
     ``shared`` are the errors that its frames share; ``same`` says that they are the flight's own, and cancel.
     """
-    good = [fit for fit in fits if fit.converged]
-    if not good:
+    if fits is None or not fits.converged.any():
         return None
-    variance = [np.column_stack([fit.sigma_position_m, fit.sigma_twist_rad]) ** 2 for fit in good]
-    sigma = np.sqrt(np.mean(variance, axis=0) / len(good))
+    good = fits[fits.converged]
+    noise = np.concatenate([good.sigma_position_m, good.sigma_twist_rad[:, :, None]], axis=2)
+    sigma = np.sqrt(np.mean(noise**2, axis=0) / len(good))
     response = None if shared is None else shared.of_shapes(half, good).mean(axis=0)
     if response is not None and not same:
         sigma, response = np.hypot(sigma, sigma_of(response)), None
-    position_m, twist_rad = ([getattr(fit, what) for fit in good] for what in ("position_m", "twist_rad"))
-    return ReferenceShape(name, np.mean(position_m, axis=0), np.mean(twist_rad, axis=0), sigma, response)
+    return ReferenceShape(name, good.position_m.mean(axis=0), good.twist_rad.mean(axis=0), sigma, response)
 
 
 def recorded(table: pa.Table, path: Path, side: str, half: HalfWing) -> ReferenceShape:

@@ -108,12 +108,12 @@ def with_motion(
     return replace(moved, centroids=replace(series.centroids, pixels=series.centroids.pixels + shift))
 
 
-def sigma_by_motion(half: HalfWing, fit: Fit, motion: SetMotion, at: int) -> Floats:
-    """(N + 1, 4) one sigma of nodes (m) and twist (rad) by the error of a set's motion, which all markers share."""
-    places = marker_places(half, fit) - motion.centre_m
-    by_motion = np.concatenate([-cross_matrix(places), np.broadcast_to(np.eye(3), (len(places), 3, 3))], axis=2)
-    response = fit.by_marker.reshape(*fit.by_marker.shape[:2], -1) @ by_motion.reshape(-1, 6)
-    return np.asarray(np.sqrt(np.einsum("nri,ij,nrj->nr", response, motion.covariance[at], response)))
+def sigma_by_motion(half: HalfWing, fits: Fit, motion: SetMotion) -> Floats:
+    """(F, N + 1, 4) one sigma of nodes (m) and twist (rad) by the error of a set's motion, which all markers share."""
+    places = marker_places(half, fits) - motion.centre_m
+    by_motion = np.concatenate([-cross_matrix(places), np.broadcast_to(np.eye(3), (*places.shape, 3))], axis=3)
+    response = fits.moved_by(by_motion)
+    return np.asarray(np.sqrt(np.sum((response @ motion.covariance[:, None]) * response, axis=3)))
 
 
 @dataclass(frozen=True, eq=False)

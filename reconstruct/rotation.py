@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+Words = NDArray[np.object_]
 
 _SERIES_LIMIT = 9.0  # |w|² up to which 15 terms of c6 and c7 are exact to rounding
 _SERIES_6 = tuple((-1.0) ** i / factorial(6 + 2 * i) for i in range(15))[::-1]

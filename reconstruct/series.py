@@ -1,8 +1,8 @@
 """A flight's marker table → the fitted shape of both half wings at every trigger."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,12 @@ from process.camera_model import RigSide
 from process.pipeline import BLOCK_TRIGGERS
 from process.reference import Window
 from process.workers import Shared, crew, usable_cores
-from reconstruct.fit import Fit, Unscaled, fit_measured, scale_of, with_residuals
+from reconstruct.fit import Fit, fit_each, scale_of, with_residuals
 from reconstruct.instants import InstantSettings
 from reconstruct.observed import Observed, enough_markers, measured_markers, observe
 from reconstruct.reference import Reference, ReferenceShape, mean_of, recorded, unloaded
 from reconstruct.root_motion import sigma_by_motion
+from reconstruct.rotation import hat
 from reconstruct.shared import SharedError, shared_errors, sigma_of
 from reconstruct.smooth import smooth_fits
 from reconstruct.tables import (
@@ -41,7 +42,6 @@ NOTHING_MEASURED = "no marker was measured in any set; look at the flags column 
 SCALE_SETS = 60  # of a flight, to choose the prior's scale from
 CORRELATION_TIMES = 4.0  # of a stretch's surroundings that smoothing takes into account
 MARGIN_S = 0.05  # markers of a set are at most this far from its instant
-SETS_AT_ONCE = 50  # whose answers to shared errors are in memory
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class FitHow:
     shared: SharedError | None = None
     """that all frames share; None: not known, sigmas hold noise only"""
     prior_scale: Floats | None = None
-    """of the prior's groups; None: each set chooses its own"""
+    """of the prior's groups; None: the sets of a stretch choose their own"""
     reference: ReferenceShape | None = None
     """what displacements are counted from; None: the unloaded wing"""
     rig: RigSide | None = None
@@ -123,7 +123,7 @@ class FitHow:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Consecutive sets of one wing that are fitted from one another, and those around them."""
+    """Consecutive sets of one wing that are fitted together, and those around them."""
 
     markers: MarkerSeries
     first: int  # the stretch is markers[first:last],
@@ -153,9 +153,9 @@ def fit_series(
 ) -> dict[str, SideFits]:
     """Fit every set of both sides; ``progress`` is told the number of sets fitted since it was last called.
 
-    Markers are first brought to their set's common instant. Each set's fit starts from the last one's, and afresh from
-    the unloaded wing at every trigger index that is a multiple of BLOCK_TRIGGERS, so that the result does not depend on
-    ``workers`` (default: one a core this process may use). A set that cannot be fitted is NaN and flagged. With
+    Markers are first brought to their set's common instant. Sets are fitted each by itself, those between two trigger
+    indices that are multiples of BLOCK_TRIGGERS together, so that the result does not depend on ``workers`` (default:
+    one a core this process may use). A set that cannot be fitted is NaN and flagged. With
     ``smooth_s`` the sets are smoothed in time over so many seconds, and sets that could not be fitted are bridged.
     ``shared`` are the errors that all frames share, by side; without, sigmas hold noise only. Displacements are counted
     from ``reference``.
@@ -178,9 +178,7 @@ def fit_series(
         cut = stretches(series, how.around_s)
         alone = Shared(how)
         window = window_ns(reference, start_ns)
-        fits = [
-            fit for one in cut if window and touches(one, window) for fit in window_fits(FitJob(one, alone, window))
-        ]
+        fits = [window_fits(FitJob(one, alone, window)) for one in cut if window and touches(one, window)]
         common = Shared(replace(how, reference=reference_shape(how, side, reference, fits)))
         jobs += [FitJob(stretch, common) for stretch in cut]
     done: dict[int, SideFits] = {}
@@ -238,12 +236,12 @@ def fit_stretch(job: FitJob) -> SideFits:
     return _gather(how, markers, points, _rows(how, fits, markers.motion))
 
 
-def window_fits(job: FitJob) -> list[Fit]:
+def window_fits(job: FitJob) -> Fit:
     """The fits of those of a stretch's own sets that lie in a window."""
     stretch = job.stretch
-    times_ns = stretch.markers.frame_timestamp_ns[stretch.first : stretch.last].tolist()
+    times_ns = stretch.markers.frame_timestamp_ns[stretch.first : stretch.last]
     _, fits = _fits(job.how.get(), stretch)
-    return [fit for at, fit in zip(times_ns, fits, strict=True) if job.window_ns[0] <= at <= job.window_ns[1]]
+    return fits[(job.window_ns[0] <= times_ns) & (times_ns <= job.window_ns[1])]
 
 
 def window_ns(reference: Reference, start_ns: int) -> tuple[int, int] | None:
@@ -259,7 +257,7 @@ def touches(stretch: Stretch, window: tuple[int, int]) -> bool:
     return bool(((times_ns >= window[0]) & (times_ns <= window[1])).any())
 
 
-def reference_shape(how: FitHow, side: str, reference: Reference, in_window: Iterable[Fit]) -> ReferenceShape:
+def reference_shape(how: FitHow, side: str, reference: Reference, in_window: Sequence[Fit]) -> ReferenceShape:
     """The shape that displacements of ``side`` are counted from; ``in_window`` are the window's fits, if it is one.
 
     Raises UsageError when it has no fitted set, or does not fit the wing.
@@ -268,7 +266,8 @@ def reference_shape(how: FitHow, side: str, reference: Reference, in_window: Ite
         return unloaded(how.half)
     if isinstance(reference, Path):
         return _from_file(how, side, reference / SHAPE if reference.is_dir() else reference)
-    found = mean_of(f"mean of {reference.begin_s:g} to {reference.end_s:g} s", how.half, in_window, how.shared)
+    fits = Fit.join(in_window) if in_window else None
+    found = mean_of(f"mean of {reference.begin_s:g} to {reference.end_s:g} s", how.half, fits, how.shared)
     if found is None:
         raise UsageError(
             f"--reference-window {reference.begin_s:g}:{reference.end_s:g}: no set of the {side} wing was fitted in it"
@@ -276,11 +275,9 @@ def reference_shape(how: FitHow, side: str, reference: Reference, in_window: Ite
     return found
 
 
-def prior_scale(how: FitHow, observed: Observed) -> Floats | None:
-    """The prior's scale that these sets (``picks``) make likeliest; None where each set is to choose its own."""
-    if how.smooth_s == 0 and how.settings.prior_weight != "data":
-        return None
-    return scale_of(observed.problems(how.half, how.settings, how.rig), how.settings)
+def prior_scale(how: FitHow, observed: Observed) -> Floats:
+    """The prior's scale that these sets (``picks``) make likeliest, if the data are to choose it."""
+    return scale_of(observed.problem(how.half, how.settings, how.rig), how.settings)
 
 
 def picks(count: int) -> Ints:
@@ -327,26 +324,25 @@ def _centroids_in(centroids: Centroids, to: Ints, time_ns: Ints) -> Centroids:
     return Centroids(pixels, spread, own, epipolar)
 
 
-def _fits(how: FitHow, stretch: Stretch) -> tuple[Ints, Iterable[Fit]]:
+def _fits(how: FitHow, stretch: Stretch) -> tuple[Ints, Fit]:
     """(F, M) samples that the markers of the stretch's own sets are made of, and their fits."""
     series, own = stretch.markers, slice(stretch.first, stretch.last)
     observed = observe(series, how.half, how.rig, how.instants)
     if how.smooth_s == 0:
         observed = observed[own]
-        fits = fits_in_turn(observed.problems(how.half, how.settings, how.rig), how.settings, how.prior_scale)
+        fits = fit_each(observed.problem(how.half, how.settings, how.rig), how.settings, how.prior_scale)
     else:
-        fits = iter(_smoothed(how, series, observed)[own])
-        observed = observed[own]
-    return observed.points, (with_residuals(how.half, *one) for one in zip(fits, observed.xyz_m, strict=True))
+        fits, observed = _smoothed(how, series, observed)[own], observed[own]
+    return observed.points, with_residuals(how.half, fits, observed.xyz_m)
 
 
-def _smoothed(how: FitHow, series: MarkerSeries, observed: Observed) -> list[Fit]:
+def _smoothed(how: FitHow, series: MarkerSeries, observed: Observed) -> Fit:
     time_s = (series.frame_timestamp_ns - series.frame_timestamp_ns[0]) * 1e-9
     if np.any(np.diff(time_s) <= 0):
         raise UsageError(f"{series.side} wing: times of the sets do not grow; smoothing in time needs that they do")
     assert how.prior_scale is not None
-    problems = observed.problems(how.half, how.settings, how.rig)
-    return smooth_fits(problems, how.settings, time_s, how.prior_scale, how.smooth_s)
+    posed = observed.problem(how.half, how.settings, how.rig)
+    return smooth_fits(posed, how.settings, time_s, how.prior_scale, how.smooth_s)
 
 
 def _from_file(how: FitHow, side: str, path: Path) -> ReferenceShape:
@@ -357,88 +353,65 @@ def _from_file(how: FitHow, side: str, path: Path) -> ReferenceShape:
     if series is None:
         raise UsageError(f"{path}: has no {side} wing; give a reference with every wing of this recording")
     places = observe(as_in(how.half, series), how.half, None, InstantSettings())
-    fits = list(fits_in_turn(places.problems(how.half, how.settings, None), how.settings, how.prior_scale))
+    fits = fit_each(places.problem(how.half, how.settings, None), how.settings, how.prior_scale)
     shared = shared_errors(table).get(side)
     same = shared is not None and how.shared is not None and shared.as_in(how.shared)
     found = mean_of(str(path), how.half, fits, shared, same=same)
     if found is None:
-        raise UsageError(f"{path}: the {side} wing at rest could not be fitted ({fits[0].reason})")
+        raise UsageError(f"{path}: the {side} wing at rest could not be fitted ({fits.reason[0]})")
     return found
 
 
-def fits_in_turn(posed: Iterable[Unscaled], settings: FitSettings, prior_scale: Floats | None) -> Iterator[Fit]:
-    """Fit consecutive sets, each from the last one's fit (one that did not converge starts nothing).
-
-    The prior's scale is that given, or each set chooses its own.
-    """
-    fit: Fit | None = None
-    for one in posed:
-        fit = fit_measured(one, settings, fit, prior_scale)
-        yield fit
-
-
-def _rows(how: FitHow, fits: Iterable[Fit], motion: SetMotion | None) -> _Rows:
-    """What SideFits has of fits, an array a field; the rest of a fit is dropped here, where it was made."""
-    rows: list[dict[str, Any]] = []
+def _rows(how: FitHow, fits: Fit, motion: SetMotion | None) -> _Rows:
+    """What SideFits has of fits; the rest of a fit is dropped here, where it was made."""
     reference = how.reference or unloaded(how.half)
-    waiting = iter(fits)
-    while some := list(islice(waiting, SETS_AT_ONCE)):
-        responses = None if how.shared is None else how.shared.of_shapes(how.half, some)
-        for k, fit in enumerate(some):
-            root = None if motion is None or not fit.converged else sigma_by_motion(how.half, fit, motion, len(rows))
-            rows.append(_row(how.half, fit, None if responses is None else responses[k], reference, root))
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
-
-
-def _row(
-    half: HalfWing, fit: Fit, shared: Floats | None, reference: ReferenceShape, root: Floats | None
-) -> dict[str, Any]:
-    net, sigma_net = _net(half, fit)
-    noise = np.column_stack([fit.sigma_position_m, fit.sigma_twist_rad])
-    noise = noise if root is None else np.hypot(noise, root)
-    response = np.zeros((*noise.shape, 1)) if shared is None else shared
+    net, sigma_net = _net(how.half, fits)
+    noise = np.concatenate([fits.sigma_position_m, fits.sigma_twist_rad[:, :, None]], axis=2)
+    if motion is not None:
+        noise = np.hypot(noise, sigma_by_motion(how.half, fits, motion))
+    response = np.zeros((*noise.shape, 1)) if how.shared is None else how.shared.of_shapes(how.half, fits)
     change = response if reference.shared is None else response - reference.shared
     sigma = np.hypot(noise, sigma_of(response))
     sigma_change = np.hypot(np.hypot(noise, sigma_of(change)), reference.sigma)
     return {
-        "xyz_m": fit.position_m,
-        "sigma_xyz_m": sigma[:, :3],
-        "noise_sigma_xyz_m": noise[:, :3],
-        "sigma_moved_m": sigma_change[:, :3],
-        "twist_rad": fit.twist_rad,
-        "sigma_twist_rad": sigma[:, 3],
-        "noise_sigma_twist_rad": noise[:, 3],
-        "sigma_twisted_rad": sigma_change[:, 3],
-        "curvature_1pm": _at_nodes(fit.strain[:, 1:]),
-        "sigma_curvature_1pm": _at_nodes(fit.sigma_strain[:, 1:]),
-        "extension": _at_nodes(fit.strain[:, 0]),
-        "sigma_extension": _at_nodes(fit.sigma_strain[:, 0]),
-        "stiffness_change": fit.stiffness_change,
-        "sigma_stiffness": fit.sigma_stiffness,
-        "residual_m": fit.residual_m,
-        "used": fit.used,
-        "loads": fit.loads,
-        "sigma_loads": np.sqrt(np.diag(fit.load_covariance)).reshape(-1, 6),
+        "xyz_m": fits.position_m,
+        "sigma_xyz_m": sigma[:, :, :3],
+        "noise_sigma_xyz_m": noise[:, :, :3],
+        "sigma_moved_m": sigma_change[:, :, :3],
+        "twist_rad": fits.twist_rad,
+        "sigma_twist_rad": sigma[:, :, 3],
+        "noise_sigma_twist_rad": noise[:, :, 3],
+        "sigma_twisted_rad": sigma_change[:, :, 3],
+        "curvature_1pm": _at_nodes(fits.strain[:, :, 1:]),
+        "sigma_curvature_1pm": _at_nodes(fits.sigma_strain[:, :, 1:]),
+        "extension": _at_nodes(fits.strain[:, :, 0]),
+        "sigma_extension": _at_nodes(fits.sigma_strain[:, :, 0]),
+        "stiffness_change": fits.stiffness_change,
+        "sigma_stiffness": fits.sigma_stiffness,
+        "residual_m": fits.residual_m,
+        "used": fits.used,
+        "loads": fits.loads,
+        "sigma_loads": np.sqrt(np.diagonal(fits.load_covariance, axis1=1, axis2=2)).reshape(fits.loads.shape),
         "net": net,
         "sigma_net": sigma_net,
-        "chi2": fit.chi2,
-        "dof": fit.dof,
-        "iterations": fit.iterations,
-        "outliers": int(fit.outlier.sum()),
-        "reason": fit.reason,
+        "chi2": fits.chi2,
+        "dof": fits.dof,
+        "iterations": fits.iterations,
+        "outliers": fits.outlier.sum(axis=1),
+        "reason": fits.reason,
     }
 
 
 def _at_nodes(of_elements: Floats) -> Floats:
-    """Values of N elements at the N + 1 nodes: the mean of a node's two."""
-    padded = np.concatenate([of_elements[:1], of_elements, of_elements[-1:]])
-    return np.asarray((padded[:-1] + padded[1:]) / 2)
+    """Values of sets' N elements (F, N, …) at the N + 1 nodes: the mean of a node's two."""
+    padded = np.concatenate([of_elements[:, :1], of_elements, of_elements[:, -1:]], axis=1)
+    return np.asarray((padded[:, :-1] + padded[:, 1:]) / 2)
 
 
 def _gather(how: FitHow, series: MarkerSeries, points: Ints, rows: _Rows) -> SideFits:
     half, reference = how.half, how.reference or unloaded(how.half)
     outliers = rows.pop("outliers")
-    reason = rows.pop("reason").astype(object)
+    reason = rows.pop("reason")
     alone = (rows["used"] & (points == 1)).any(axis=1)
     bridged = (reason == "") & ~rows["used"].any(axis=1)
     flagged = {"not_fitted": reason != "", "outlier": outliers > 0, "row_time": alone, "bridged": bridged}
@@ -470,12 +443,12 @@ def _gather(how: FitHow, series: MarkerSeries, points: Ints, rows: _Rows) -> Sid
     )
 
 
-def _net(half: HalfWing, fit: Fit) -> tuple[Floats, Floats]:
-    """Sum of the loads and of their moments about the root, (6,), and its sigma (6,)."""
-    nodes = [half.node_at(station) for station in fit.load_s_m]
-    sums = np.zeros((6, len(nodes), 6))
-    for at, (x, y, z) in enumerate(fit.position_m[nodes] - fit.position_m[0]):
-        sums[:, at] = np.eye(6)
-        sums[3:, at, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    flat = sums.reshape(6, -1)
-    return flat @ fit.loads.ravel(), np.sqrt(np.einsum("ia,ab,ib->i", flat, fit.load_covariance, flat))
+def _net(half: HalfWing, fits: Fit) -> tuple[Floats, Floats]:
+    """Sums (F, 6) of the loads and of their moments about the root, and their sigma (F, 6)."""
+    nodes = [half.node_at(station) for station in fits.load_s_m]
+    sums = np.zeros((len(fits), 6, len(nodes), 6))
+    sums[:] = np.eye(6)[:, None, :]
+    sums[:, 3:, :, :3] = hat(fits.position_m[:, nodes] - fits.position_m[:, :1]).swapaxes(1, 2)
+    flat = sums.reshape(len(fits), 6, -1)
+    net = (flat @ fits.loads.reshape(len(fits), -1, 1))[:, :, 0]
+    return net, np.sqrt(np.sum((flat @ fits.load_covariance) * flat, axis=2))

@@ -5,7 +5,7 @@ that nodes and twist have the error R δ' with R the fit's response times J time
 vector of independent unit errors. A displacement between two sets has (R₂ − R₁) δ', mostly far less than either.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,22 +30,20 @@ class SharedError:
         """Whether both are the errors of one calibration, mount and kind of light, so that one draw is in both."""
         return self.light == other.light and self.rig.to_dict() == other.rig.to_dict()
 
-    def of_shapes(self, half: HalfWing, fits: Sequence[Fit]) -> Array:
-        """R (F, N + 1, 4, P): the shift of the nodes (m, body frame) and of their twist (rad) by each unit error.
+    def of_shapes(self, half: HalfWing, fits: Fit) -> Array:
+        """R (F, N + 1, 4, P) of F fits: the shift of the nodes (m, body frame) and of twist (rad) by each unit error.
 
         NaN where a fit did not converge.
         """
-        nodes, markers = len(half.node_s_m), len(half.marker_ids)
-        R = np.full((len(fits), nodes, 4, self.root.shape[1]), np.nan)
-        good = [k for k, fit in enumerate(fits) if fit.converged]
-        if not good:
+        R = np.full((*fits.by_told.shape[:3], self.root.shape[1]), np.nan)
+        if not fits.converged.any():
             return R
-        points = np.concatenate([marker_places(half, fits[k]) for k in good])
-        up = np.concatenate([fits[k].R_body_section[half.marker_node][:, :, 2] for k in good])
-        of_markers = shared_jacobian(self.rig, points, Surface(self.light, up)) @ self.root
-        of_markers = np.where(np.isfinite(of_markers), of_markers, 0.0)  # out of view, and so not in use
-        for k, own in zip(good, of_markers.reshape(len(good), 3 * markers, -1), strict=True):
-            R[k] = fits[k].by_marker.reshape(nodes, 4, 3 * markers) @ own
+        good = fits if fits.converged.all() else fits[fits.converged]
+        places = marker_places(half, good)
+        up = good.R_body_section[:, half.marker_node, :, 2]
+        J = shared_jacobian(self.rig, places.reshape(-1, 3), Surface(self.light, up.reshape(-1, 3))) @ self.root
+        J = np.where(np.isfinite(J), J, 0.0)  # out of view, and so not in use
+        R[fits.converged] = good.moved_by(J.reshape(*places.shape, -1))
         return R
 
 

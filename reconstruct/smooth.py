@@ -5,12 +5,11 @@ without enough markers are bridged, with bands as wide as the neighbours allow. 
 docs/explanation/beam.md.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from reconstruct.fit import Fit, Unscaled, fit_from, fit_measured, scaled
+from reconstruct.fit import SETS_AT_ONCE, Fit, Unscaled, fit_each, fit_from, scaled
 from reconstruct.iteration import linearise
+from reconstruct.posterior import information_of, with_rows
 from reconstruct.rotation import Array, Mask
 from reconstruct.wing_file import FitSettings
 
@@ -18,13 +17,7 @@ _TOLD = 1e-3  # an unknown's direction of which no set tells more is left to the
 _FARTHEST = 3.0  # correlation times: what lies farther from the next fitted set is not bridged
 
 
-def smooth_fits(
-    posed: Sequence[Unscaled],
-    settings: FitSettings,
-    time_s: Array,
-    prior_scale: Array,
-    correlation_s: float,
-) -> list[Fit]:
+def smooth_fits(posed: Unscaled, settings: FitSettings, time_s: Array, prior_scale: Array, correlation_s: float) -> Fit:
     """Fit F sets by themselves, then smooth what they tell (Rauch, Tung & Striebel 1965; eqs. 28 and 29).
 
     Args:
@@ -40,38 +33,33 @@ def smooth_fits(
     """
     if settings.loads != "everywhere":
         raise ValueError('smoothing needs loads = "everywhere"')
-    single = []
-    before: Fit | None = None
-    for one in posed:
-        before = fit_measured(one, settings, before, prior_scale)
-        single.append(before)
-    good: Mask = np.array([fit.converged for fit in single], dtype=bool)
-    if good.sum() < 2:
+    single = fit_each(posed, settings, prior_scale)
+    good = np.flatnonzero(single.converged)
+    if good.size < 2:
         return single
-    told = [_told(one, fit, prior_scale) if fit.converged else None for one, fit in zip(posed, single, strict=True)]
-    average = np.mean([information for information, _ in filter(None, told)], axis=0)
-    size, direction = np.linalg.eigh(average)
+    information, product = _told(posed[good], single[good], prior_scale)
+    size, direction = np.linalg.eigh(information.mean(axis=0))
     kept = direction[:, size > _TOLD]
-    mean, spread = _rts(
-        time_s, [t and (kept.T @ t[0] @ kept, kept.T @ t[1]) for t in told], kept.shape[1], correlation_s
-    )
-    near = _reachable(time_s, good, _FARTHEST * correlation_s)
+    told: list[tuple[Array, Array] | None] = [None] * len(posed)
+    for at, one, other in zip(good.tolist(), kept.T @ information @ kept, product @ kept, strict=True):
+        told[at] = one, other
+    mean, spread = _rts(time_s, told, kept.shape[1], correlation_s)
+    near = np.flatnonzero(_reachable(time_s, single.converged, _FARTHEST * correlation_s))
     left = np.eye(len(kept)) - kept @ kept.T
-    out = []
-    for i, (one, fit) in enumerate(zip(posed, single, strict=True)):
-        if not near[i]:
-            out.append(fit)
-            continue
-        out.append(fit_from(one, settings, fit, kept @ mean[i], kept @ spread[i] @ kept.T + left, prior_scale))
-    return out
+    means, spreads = mean[near] @ kept.T, kept @ spread[near] @ kept.T + left
+    parts = []
+    for first in range(0, near.size, SETS_AT_ONCE):
+        some = slice(first, first + SETS_AT_ONCE)
+        rows = near[some]
+        parts.append(fit_from(posed[rows], settings, single[rows], means[some], spreads[some], prior_scale))
+    return with_rows(single, near, Fit.join(parts))
 
 
-def _told(posed: Unscaled, fit: Fit, scale: Array) -> tuple[Array, Array]:
-    """A set's own information (u, u) and its product with the likeliest unknowns (u,), the prior taken out."""
-    linear = linearise(scaled(posed, scale), fit.strain, fit.unknowns)
-    A = linear.jacobian[fit.used].reshape(-1, len(fit.unknowns))
-    information = A.T @ A
-    return information, information @ fit.unknowns + fit.unknowns
+def _told(posed: Unscaled, fits: Fit, scale: Array) -> tuple[Array, Array]:
+    """Sets' own information (F, u, u) and its product with the likeliest unknowns (F, u), the prior taken out."""
+    linear = linearise(scaled(posed, scale), fits.strain, fits.unknowns)
+    information = information_of(linear, fits.used.astype(np.float64))
+    return information, (information @ fits.unknowns[:, :, None])[:, :, 0] + fits.unknowns
 
 
 def _rts(

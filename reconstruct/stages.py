@@ -185,17 +185,17 @@ def _common(source: "_Markers", plan: FitPlan, hands: Crew) -> dict[str, Shared[
     for number, scale in hands.results(_scale, scale_jobs):
         side = source.sides[number]
         hows[side] = replace(hows[side], prior_scale=scale)
-    in_window: dict[str, dict[int, list[Fit]]] = {side: {} for side in source.sides}
+    in_window: dict[str, dict[int, Fit]] = {side: {} for side in source.sides}
     window = window_ns(plan.reference, source.start_ns)
     if window is not None:
         alone = {side: Shared(how) for side, how in hows.items()}
         inside = [key for key in source.sets if touches(source.stretch(key), window)]
         jobs = (FitJob(source.stretch(key), alone[key.side], window) for key in inside)
-        for number, fits in hands.results(window_fits, jobs):
-            in_window[inside[number].side][number] = fits
+        for number, found in hands.results(window_fits, jobs):
+            in_window[inside[number].side][number] = found
     common = {}
     for side, how in hows.items():
-        fits = [fit for _, found in sorted(in_window[side].items()) for fit in found]
+        fits = [part for _, part in sorted(in_window[side].items())]
         common[side] = Shared(replace(how, reference=reference_shape(how, side, plan.reference, fits)))
     return common
 
@@ -306,7 +306,7 @@ def _series(
     return as_in(wing.half(key.side), series)
 
 
-def _scale(job: _ScaleJob) -> Floats | None:
+def _scale(job: _ScaleJob) -> Floats:
     return prior_scale(job.how.get(), job.observed)
 
 

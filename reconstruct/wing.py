@@ -75,6 +75,12 @@ class HalfWing:
         return points
 
     @cached_property
+    def marked_nodes(self) -> tuple[Index, Index]:
+        """The nodes that have markers, ascending, and (M,) which of these each marker is at."""
+        nodes, which = np.unique(self.marker_node, return_inverse=True)
+        return nodes, which
+
+    @cached_property
     def rest_incidence_rad(self) -> Array:
         """(N + 1,) incidence of the unloaded wing."""
         return incidence_rad(self, self.beam.rest.R_body_section)
@@ -156,34 +162,34 @@ def build_wing(described: WingFile, nodes_at_m: tuple[float, ...] = ()) -> Wing:
 
 
 def incidence_rad(half: HalfWing, R_body_section: Array) -> Array:
-    """Incidence of sections ``R_body_section`` (n, 3, 3), nose-up positive, (n,): see docs/ARCHITECTURE.md."""
+    """Incidence of sections ``R_body_section`` (…, 3, 3), nose-up positive, (…): see docs/ARCHITECTURE.md."""
     _, f0, u0, _ = _level(half, R_body_section)
-    forward = half.sign * R_body_section[:, :, 1]
-    incidence: Array = np.arctan2(np.sum(forward * u0, axis=1), np.sum(forward * f0, axis=1))
+    forward = half.sign * R_body_section[..., 1]
+    incidence: Array = np.arctan2(np.sum(forward * u0, axis=-1), np.sum(forward * f0, axis=-1))
     return incidence
 
 
 def twist_rad(half: HalfWing, R_body_section: Array) -> Array:
-    """Incidence at the nodes (N + 1, 3, 3) minus the unloaded wing's at the same arc length: (N + 1,)."""
+    """Incidence at the nodes (…, N + 1, 3, 3) minus the unloaded wing's at the same arc length: (…, N + 1)."""
     difference = incidence_rad(half, R_body_section) - half.rest_incidence_rad
     return (difference + np.pi) % (2 * np.pi) - np.pi
 
 
 def twist_gradient(half: HalfWing, R_body_section: Array) -> Array:
-    """d twist / d (small rotation vector of the section, body frame): (N + 1, 3).
+    """d twist / d (small rotation vector of the section, body frame): (…, 3) of sections (…, 3, 3).
 
     Turning a section about its axis changes incidence one to one; turning the axis itself also turns the level
     direction f0 about it, by (x·t)/|f0| of the turn, which is taken off.
     """
     t, _, u0, length = _level(half, R_body_section)
-    return half.sign * t - (t[:, 0] / length)[:, None] * cross(t, u0)
+    return half.sign * t - (t[..., 0] / length)[..., None] * cross(t, u0)
 
 
 def _level(half: HalfWing, R_body_section: Array) -> tuple[Array, Array, Array, Array]:
-    t = R_body_section[:, :, 0]
-    level = t[:, :1] * t - np.array([1.0, 0.0, 0.0])
-    length = np.linalg.norm(level, axis=1)
-    f0 = level / length[:, None]
+    t = R_body_section[..., 0]
+    level = t[..., :1] * t - np.array([1.0, 0.0, 0.0])
+    length = np.linalg.norm(level, axis=-1)
+    f0 = level / length[..., None]
     return t, f0, half.sign * cross(t, f0), length
 
 

@@ -8,7 +8,8 @@ from scipy.stats import binomtest
 
 from process.camera_model import CameraModel, Light, MarkerLayout, Rig, RigSide, StereoPair
 from process.shared_error import shared_covariance, with_rig
-from reconstruct.fit import Fit, fit_frame
+from reconstruct.fit import fit_frame
+from reconstruct.posterior import Fit
 from reconstruct.reference import mean_of
 from reconstruct.shared import SharedError, shared_errors, sigma_of
 
@@ -53,13 +54,13 @@ def test_the_response_is_what_refits_do(xhale, closed_form, shared):
     xyz = truth.markers_m.copy()
     xyz[3] = np.nan
     fit = fitted(xhale, xyz)
-    response = shared.of_shapes(xhale.right, [fit])[0]
+    response = shared.of_shapes(xhale.right, Fit.join([fit]))[0]
     rng = np.random.default_rng(3)
     for _ in range(5):
         push = rng.normal(size=xyz.shape) * 2e-5
         ahead, behind = (fitted(xhale, xyz + sign * push, fit) for sign in (1, -1))
         found = np.column_stack([ahead.position_m - behind.position_m, ahead.twist_rad - behind.twist_rad]) / 2
-        expected = np.einsum("nimj,mj->ni", fit.by_marker, np.nan_to_num(push))
+        expected = fit.moved_by(np.nan_to_num(push)[:, :, None])[:, :, 0]
         # Gauss–Newton leaves out how the response itself changes with the residuals
         assert np.abs(found - expected).max() < 0.02 * np.abs(found).max()
     assert response.shape == (len(truth.position_m), 4, 32)
@@ -69,9 +70,9 @@ def test_shapes_and_displacements_hold_the_truth(xhale, closed_form, side, share
     """400 rigs, each off by a draw of what is stated of it; markers without noise: all of the error is shared."""
     rest, flight = (closed_form(xhale.right, *state) for state in ((0.05, 0.3, 0.0), (0.3, 2.5, 0.01)))
     fits = [fitted(xhale, truth.markers_m) for truth in (rest, flight)]
-    reference = mean_of("rest", xhale.right, [fits[0]], shared)
+    reference = mean_of("rest", xhale.right, Fit.join(fits[:1]), shared)
     assert reference is not None
-    response = shared.of_shapes(xhale.right, fits)[1]
+    response = shared.of_shapes(xhale.right, Fit.join(fits))[1]
     sigma, sigma_moved = sigma_of(response), sigma_of(response - reference.shared)
     at = [len(sigma) // 2, len(sigma) - 1]
     assert (sigma_moved[at, :3] < sigma[at, :3]).all()  # the pose's shift is in both
