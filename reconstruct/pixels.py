@@ -64,6 +64,7 @@ class Seen:
         Where a light cannot be (behind a camera), it has no pull for this step.
         """
         image, slope = np.zeros(self.given.shape), np.zeros((*self.given.shape, 3))
+        point = np.broadcast_to(point, (*self.given.shape[:-2], 3))
         flat = point.reshape(-1, 3)
         cameras = self.rig.pair.cam0, self.rig.pair.cam1
         for at, (camera, T) in enumerate(zip(cameras, _cameras_from_body(self.rig), strict=True)):
