@@ -57,7 +57,8 @@ class Fit:
         """(N + 1, 4, P) how nodes (m) and twist (rad) follow, when markers are measured elsewhere by (M, 3, P)."""
         flat = markers.reshape(*markers.shape[:-3], -1, markers.shape[-1])
         told = self.told_by.reshape(*self.told_by.shape[:-2], -1) @ flat
-        return np.asarray(self.by_told @ told[..., None, :, :])
+        by_told = self.by_told.reshape(*told.shape[:-2], -1, told.shape[-2])
+        return np.asarray((by_told @ told).reshape(*self.by_told.shape[:-1], -1))
 
     def __len__(self) -> int:
         """F."""
