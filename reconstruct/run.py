@@ -68,15 +68,15 @@ class Step:
 Progress = Callable[[Step], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Job:
     """What to reconstruct, and where to."""
 
-    flights: tuple[Path, ...]  # folders of one flight; empty when there is a marker table
-    rig: Path | None  # needed with flights
-    markers: Path | None
     wing: Path
     out: Path
+    flights: tuple[Path, ...] = ()  # folders of one flight; empty when there is a marker table
+    rig: Path | None = None  # needed with flights
+    markers: Path | None = None
     csv: bool = True
     workers: int | None = None  # None: one a core
     command: str = ""  # as it is recorded in the files

@@ -7,6 +7,7 @@ from the page cache, reconstructs it, the first one again from the cache, and pr
 import argparse
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -26,8 +27,8 @@ def main() -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     calibrate(folder)
-    print("| flight | frames from | × real time | × reading alone | peak MB | shape mm | twist ° |")
-    print("|---|---|---|---|---|---|---|")
+    print("| flight | frames from | × real time | × reading alone | CPU s a second | peak MB | shape mm | twist ° |")
+    print("|---|---|---|---|---|---|---|---|")
     for number, seconds in enumerate(float(text) for text in given.seconds.split(",")):
         flight = folder / "flight"
         sunlit = f"{0.4 * seconds:g}:{0.6 * seconds:g}"
@@ -58,14 +59,17 @@ def report(folder: Path, seconds: float, source: str) -> None:
     """Reconstruct the flight, compare it with its truth, and print a row."""
     disks = ("flight/ssd_left", "flight/ssd_right")
     shutil.rmtree(folder / "out", ignore_errors=True)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     run(folder, "reconstruct", *disks, "--rig", "rig.json", "--wing", "wing.toml", "-o", "out", "--no-report")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     summary = json.loads((folder / "out/summary.json").read_text())
     compared = json.loads(
         run(folder, "reconstruct", "compare", "out", "flight/truth", "--reference-window", "0:2", "--json")
     )
     print(
         f"| {seconds:g} s | {source} | {summary['times_real_time']:.2f} | {summary['read_ratio']:.1f} | "
-        f"{summary['peak_mb']:.0f} | {compared['displacement_rms_mm']:.2f} | "
+        f"{cpu_s / seconds:.3f} | {summary['peak_mb']:.0f} | {compared['displacement_rms_mm']:.2f} | "
         f"{compared['displacement_twist_rms_deg']:.3f} |",
         flush=True,
     )

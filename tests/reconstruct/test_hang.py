@@ -85,7 +85,9 @@ def rest_table(halves, softer: float, path: Path, sets: int = 25) -> Path:
 def test_a_run_says_so(halves, tmp_path):
     """Both wings 20 % softer than their file."""
     table, wing = rest_table(halves, 0.2, tmp_path / "markers.parquet"), example_path("xhale.toml")
-    summary, _ = run_job(Job((), None, table, wing, tmp_path / "out", csv=False, workers=1, reference=Window(0, 1)))
+    summary, _ = run_job(
+        Job(markers=table, wing=wing, out=tmp_path / "out", csv=False, workers=1, reference=Window(0, 1))
+    )
     for half in halves:
         assert summary["at_rest"][half.side]["softer_percent"] == pytest.approx(20.0, abs=0.5)
     assert sum("softer than its file" in line for line in summary["warnings"]) == 2
@@ -101,7 +103,7 @@ def test_at_rest_the_air_does_nothing(halves, tmp_path):
     keys = sets.rename_columns(["trigger_index", "side", "timestamp_ns"])
     gravity = Signal("nz", "/can", "g", 10**18 + np.arange(-10, 300) * 10_000_000, np.ones(310))
     pq.write_table(signal_table(keys, Signals((gravity,))), signals_path(table))
-    job = Job((), None, table, wing, tmp_path / "out", report=False, workers=1)
+    job = Job(markers=table, wing=wing, out=tmp_path / "out", report=False, workers=1)
     run_job(replace(job, specific_force=parse_specific_force("nz")))
     air = pq.read_table(tmp_path / "out" / "aerodynamic.parquet").to_pandas()
     frames = pq.read_table(tmp_path / "out" / "frames.parquet").to_pandas()

@@ -114,7 +114,7 @@ def job(flight: Flight, wing_file: Path, folder: Path, **how: Any) -> tuple[Path
     pq.write_table(flight.table, path)
     out = folder / "out"
     given = {"csv": False, "report": False, "workers": 1} | how
-    summary, _ = run_job(Job((), None, path, wing_file, out, **given))
+    summary, _ = run_job(Job(markers=path, wing=wing_file, out=out, **given))
     return out, summary
 
 

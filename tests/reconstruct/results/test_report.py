@@ -63,7 +63,10 @@ def result(bending_wing: Any, wing_file: Path, tmp_path_factory: pytest.TempPath
     pq.write_table(signal_table(sets, Signals((load_factor,))), signals_path(folder / "table.parquet"))
     truth = bending_wing().reference(folder / "truth <&>", np.arange(-0.1, 0.6, 0.01))
     out = folder / "out"
-    run_job(Job((), None, folder / "table.parquet", wing_file, out, True, 1, "made by a test"), lambda *_: None)
+    run_job(
+        Job(markers=folder / "table.parquet", wing=wing_file, out=out, workers=1, command="made by a test"),
+        lambda *_: None,
+    )
     run_comparison(out, truth, out, "compared by a test")
     return out
 
@@ -245,7 +248,9 @@ def test_sums_over_the_flight_are_those_of_the_tables(result: Path) -> None:
 def test_one_wing_and_one_set_are_enough(bending_wing: Any, wing_file: Path, tmp_path: Path) -> None:
     table = bending_wing().marker_table(np.array([0.0]), sigma_m=0.001)
     pq.write_table(table.filter(np.asarray(table.column("side")) == "right"), tmp_path / "right.parquet")
-    job = Job((), None, tmp_path / "right.parquet", wing_file, tmp_path / "out", False, 1, "")
+    job = Job(
+        markers=tmp_path / "right.parquet", wing=wing_file, out=tmp_path / "out", workers=1, command="", csv=False
+    )
     summary, _ = run_job(job, lambda *_: None)
     assert summary["sides"] == ["right"]
     assert not list((tmp_path / "out").glob("*.csv"))
@@ -257,7 +262,10 @@ def test_nothing_fitted_is_an_error_that_says_why(bending_wing: Any, wing_file: 
     few = np.asarray(table.column("marker")) < 2
     pq.write_table(table.filter(few), tmp_path / "few.parquet")
     with pytest.raises(ReconstructError, match=r"no set could be fitted \(2 of 18 markers measured"):
-        run_job(Job((), None, tmp_path / "few.parquet", wing_file, tmp_path / "out", True, 1, ""), lambda *_: None)
+        run_job(
+            Job(markers=tmp_path / "few.parquet", wing=wing_file, out=tmp_path / "out", workers=1, command=""),
+            lambda *_: None,
+        )
     assert (tmp_path / "out" / "frames.csv").is_file()
     with pytest.raises(ReconstructError, match="nothing to report"):
         write_report(read_result(tmp_path / "out"), tmp_path / "out")
@@ -270,7 +278,10 @@ def test_a_new_run_removes_the_old_comparison(bending_wing: Any, wing_file: Path
     for old in ("comparison.json", "shape.csv", "figures/error-in-time.png"):
         (tmp_path / "out" / old).parent.mkdir(exist_ok=True)
         (tmp_path / "out" / old).write_text("{}")
-    run_job(Job((), None, tmp_path / "table.parquet", wing_file, tmp_path / "out", False, 1, ""), lambda *_: None)
+    run_job(
+        Job(markers=tmp_path / "table.parquet", wing=wing_file, out=tmp_path / "out", workers=1, command="", csv=False),
+        lambda *_: None,
+    )
     for old in ("comparison.json", "shape.csv", "figures/error-in-time.png"):
         assert not (tmp_path / "out" / old).exists()
 
