@@ -1,4 +1,4 @@
-"""A result folder's tables → dense arrays by side, and those to MATLAB and NetCDF files, pandas and xarray."""
+"""A result folder's tables → dense arrays by side, and those to NetCDF files, pandas and xarray."""
 
 import json
 from collections.abc import Mapping
@@ -9,17 +9,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from scipy.io import savemat
 
-from capture.errors import ReconstructError, UsageError
+from capture.errors import UsageError
 from reconstruct.result import SUMMARY, read_json_object
 from reconstruct.tables import FRAMES, LOADS, MARKERS, RESIDUALS, SHAPE, SIDES, UNLOADED, read_table
 
-MAT = "result.mat"
 NETCDF = "result.nc"
 ITEMS = {SHAPE: "station", FRAMES: "", LOADS: "load_station", RESIDUALS: "marker", MARKERS: "marker"}
 """of each table, what a set has several of"""
-_MAT_NAME = 63  # characters that MATLAB allows
 
 Arrays = Mapping[str, np.ndarray[Any, Any]]
 
@@ -77,7 +74,7 @@ class ResultFolder:
             }
             sides.append(xarray.Dataset(variables, coordinates).assign_coords(side=side))
         whole = xarray.concat(sides, "side", join="outer", coords="different", compat="equals")
-        whole.attrs["wingshape"] = json.dumps(_how(self.summary))
+        whole.attrs["wingshape"] = json.dumps(how_made(self.summary))
         return whole
 
 
@@ -94,30 +91,6 @@ def dense_tables(folder: Path, tables: tuple[str, ...]) -> dict[str, dict[str, d
             if own.num_rows:
                 found.setdefault(side, {})[name] = _dense(own, ITEMS[name], str(folder / name))
     return found
-
-
-def write_mat(folder: Path) -> Path:
-    """``result.mat`` in the result's folder: a struct a side, in it one a table, and how the result was made."""
-    tables = dense_tables(folder, tuple(ITEMS))
-    content: dict[str, Any] = {
-        side: {
-            Path(name).stem: {column[:_MAT_NAME]: values for column, values in arrays.items()}
-            for name, arrays in own.items()
-        }
-        for side, own in tables.items()
-    }
-    summary = ResultFolder(folder).summary
-    content["wingshape"] = {"made": json.dumps(_how(summary)), "reference": summary.get("reference", "")}
-    path = folder / MAT
-    part = path.with_name(f"{MAT}.part")
-    try:
-        with part.open("wb") as file:
-            savemat(file, content, do_compression=True, long_field_names=True)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise ReconstructError(f"{path}: cannot be written ({error.strerror or error})") from error
-    return path
 
 
 def write_netcdf(folder: Path) -> Path:
@@ -157,5 +130,6 @@ def _dense(table: pa.Table, item: str, name: str) -> dict[str, Any]:
     return arrays
 
 
-def _how(summary: Mapping[str, Any]) -> dict[str, Any]:
+def how_made(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """What a file says of how it was made."""
     return {key: summary.get(key) for key in ("version", "command", "versions", "inputs", "recording", "config")}

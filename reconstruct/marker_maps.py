@@ -4,11 +4,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from reconstruct.figures import WIDTH_IN, time_label
 from reconstruct.result import Result
 from reconstruct.tables import Floats, Ints
+
+_PALE_BLUES = LinearSegmentedColormap.from_list("pale blues", ["#ffffff", "#7db8da"])
 
 
 def residuals_by_marker(result: Result) -> Figure:
@@ -36,7 +39,7 @@ def markers_seen(result: Result) -> Figure:
 def markers_map(result: Result) -> Figure:
     """Share of the sets in which each marker was measured, in time."""
     values = {name: (side.health.marker, side.health.seen_in_time_percent) for name, side in result.sides.items()}
-    return time_map(result, values, "measured in … % of the sets", "Blues", (0.0, 100.0))
+    return time_map(result, values, "measured in … % of the sets", _PALE_BLUES, (0.0, 100.0))
 
 
 def error_by_marker(result: Result) -> Figure:
@@ -84,7 +87,7 @@ def time_map(
     result: Result,
     values: Mapping[str, tuple[Ints, Floats]],
     label: str,
-    colours: str,
+    colours: str | Colormap,
     limits: tuple[float, float],
 ) -> Figure:
     """A number a marker and part of the flight (P, M), as colour: time to the right, tips outside."""

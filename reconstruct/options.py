@@ -45,6 +45,7 @@ Mat = Annotated[bool, typer.Option(help="Write result.mat for MATLAB.")]
 Mcap = Annotated[bool, typer.Option(help="Write wing.mcap, the wing in 3-D for Foxglove.")]
 Netcdf = Annotated[bool, typer.Option(help="Write result.nc (NetCDF; needs xarray).")]
 Report = Annotated[bool, typer.Option(help="Draw the report; `reconstruct report` can do so later.")]
+Animation = Annotated[bool, typer.Option(help="Film the wing with the report: wing.mp4, 20 s at most.")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")]
 Scheduler = Annotated[
     str | None,

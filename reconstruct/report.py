@@ -13,7 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from capture.errors import ReconstructError
-from reconstruct import figures, marker_maps, page, signal_figure
+from reconstruct import figures, marker_maps, page, signal_figure, spectrum_figure
+from reconstruct.frame_pictures import read_frame_pictures
 from reconstruct.page import number, table, text
 from reconstruct.result import FIGURES, REPORT, Result
 from reconstruct.summary import verdict
@@ -75,6 +76,14 @@ PLATES = (
         figures.loads,
     ),
     Plate(
+        "spectrum",
+        "Spectrum and modes",
+        "Power of the tips' motion by frequency (Welch's method), and what stands out of it. In flight this is the "
+        "wing with its air and its aircraft, not the wing by itself; slow manoeuvres are at the left end.",
+        spectrum_figure.spectra,
+        spectrum_figure.has_spectrum,
+    ),
+    Plate(
         "residuals-in-time",
         "How well the model agrees with the markers",
         "Distance between measured and fitted markers, RMS over the markers of a set, and the same weighed with the "
@@ -97,8 +106,8 @@ PLATES = (
     Plate(
         "sigmas",
         "How well the model agrees with the markers",
-        "One sigma of position (length of the three axes' sigmas) and twist, from image noise and the prior on the "
-        "loads. Errors of calibration and survey are not in it.",
+        "One sigma of position (length of the three axes' sigmas) and twist: image noise, the prior on the loads, "
+        "and what all frames share (calibration, mount, lights), as far as the marker table states it.",
         figures.sigmas,
     ),
     Plate(
@@ -158,7 +167,10 @@ def write_report(result: Result, folder: Path) -> Path:
         sections.setdefault(plate.section, []).append(page.picture(plate.name, plate.caption, png))
     if result.comparison is not None:
         sections["Error against the reference"].append(_marker_table(result.comparison))
-    sections["What was measured"].append(_ledger(result))
+    if "Spectrum and modes" in sections:
+        sections["Spectrum and modes"].append(spectrum_figure.mode_table(result))
+    sections["What was measured"] += [_ledger(result), _timing(result)]
+    sections["What the cameras saw"] = [_frames(result)]
     body = [_head(result)]
     body += [f"<section><h2>{text(title)}</h2>{''.join(parts)}</section>" for title, parts in sections.items() if parts]
     body.append(_made_from(result))
@@ -291,6 +303,43 @@ def _ledger(result: Result) -> str:
                 rows.append((f"{kind}: {word}", name, count, sets))
     shown = [(what, name, count, total, f"{100 * count / total:.2f} %") for what, name, count, total in rows]  # type: ignore[operator]
     return table(("missing or flagged", "wing", "count", "of", "share"), shown)
+
+
+def _timing(result: Result) -> str:
+    """How well the instants are known, and what the recording says of its own losses."""
+    rows = []
+    for name, side in result.sides.items():
+        sigma_us = 1e-3 * side.frames["time_sigma_ns"]
+        known = sigma_us[np.isfinite(sigma_us)]
+        said = f"{np.median(known):.1f} µs median, {known.max():.1f} µs at worst" if known.size else "not known"
+        clock = ", ".join(f"{state} {count}" for state, count in _most(side.words["ptp_state"]))
+        steps = np.diff(side.timestamp_ns) * 1e-6
+        pace = f"{np.median(steps):.3f} ms apart, at most {steps.max():.3f} ms" if steps.size else "one"
+        rows.append((name, side.trigger_index.size, pace, said, clock))
+    parts = [table(("wing", "sets", "their instants", "one sigma of an instant", "PTP: sets"), rows)]
+    problems = result.summary.get("problems", [])
+    parts += [table(("what the recording lacks",), [(line,) for line in problems])] if problems else []
+    return "".join(parts)
+
+
+def _frames(result: Result) -> str:
+    pictures = read_frame_pictures(result.folder)
+    if pictures is None:
+        return (
+            "<p>This result was made from a marker table, so that there are no frames to show: they are shown when "
+            "<code>reconstruct</code> is given the flight.</p>"
+        )
+    shown = [
+        page.picture(
+            Path(one.file).stem, one.caption, (result.folder / FIGURES / one.file).read_bytes(), "jpeg"
+        ).replace("<figure ", '<figure tabindex="0" ')
+        for one in pictures
+    ]
+    said = (
+        "Parts of frames, brightened: markers in blue by their numbers, in yellow where only this camera saw one, "
+        "other lights in white, spots that were turned down in red with the reason. Select one to enlarge it."
+    )
+    return f"<p class='sub'>{said}</p><div class='frames'>{''.join(shown)}</div>"
 
 
 def _most(counts: Mapping[str, int]) -> list[tuple[str, int]]:

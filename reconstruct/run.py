@@ -28,19 +28,23 @@ from process.signal_table import MAX_GAP_S
 from process.tables import MARKER_SCHEMA, TableWriter, write_table
 from process.workers import Crew, crew, usable_cores
 from reconstruct.air_table import AIR, SpecificForce, air_table
+from reconstruct.animation import remove_animation, write_animation
 from reconstruct.assemble import Target, assemble
 from reconstruct.beside import Beside, beside_flight, beside_markers
 from reconstruct.compare import Comparison, compare
-from reconstruct.dense import MAT, NETCDF, write_mat, write_netcdf
+from reconstruct.dense import NETCDF, write_netcdf
+from reconstruct.frame_pictures import moments, remove_frame_pictures, write_frame_pictures
 from reconstruct.hang import DOUBTFUL_SIGMAS, recorded_hangs
 from reconstruct.identify import identify
 from reconstruct.iteration import FEWEST_MARKERS
+from reconstruct.mat_file import MAT, write_mat
 from reconstruct.observed import measured_markers
 from reconstruct.reference import Reference
 from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, MARKER_ERRORS, REPORT, SHAPE_ERRORS, SUMMARY, read_json_object, read_result
 from reconstruct.root_motion import RootMotion
 from reconstruct.scene import SCENE, write_scene
+from reconstruct.series import window_ns
 from reconstruct.shared import SharedError, shared_errors
 from reconstruct.stages import Cameras, FitPlan, Key, fit, measure, root_motions, sampled, take
 from reconstruct.summary import holes, summarise
@@ -52,6 +56,7 @@ FORMATS = ("mat", "mcap", "netcdf")
 MODULES = ("reconstruct.stages",)  # what a worker loads before the clock starts
 BYTES_A_SECOND = 500e6  # of frames that one core works off, roughly,
 ROWS_A_SECOND = 6000.0  # and of markers
+PROBLEMS_LISTED = 100  # in the summary
 WORTH_A_WORKER_S = 1.5  # starting one takes a second
 
 
@@ -84,6 +89,7 @@ class Job:
     reference: Reference = None  # what displacements are counted from; None: the unloaded wing
     also: tuple[str, ...] = ("mat", "mcap")  # of FORMATS
     report: bool = True
+    animation: bool = False  # with the report
     scheduler: str | None = None  # a Dask scheduler's address, or local; None: processes of our own
     settings: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
     dbc: tuple[Path, ...] = ()  # what the recorded CAN frames mean
@@ -188,17 +194,16 @@ def run_job(
         "flights": [str(path) for path in job.flights],
     }
     problems = (*source.problems, *(line for key in measured for line in store.read(key.markers).note["problems"]))
+    summary["problems"] = list(problems[:PROBLEMS_LISTED])
     write_json(job.out / SUMMARY, summary)
     if not summary["converged_percent"]:
         reason = found.frames.column("reason")[0].as_py()
         raise ReconstructError(f"{source.name}: no set could be fitted ({reason}); see {job.out / FRAMES}")
     _write_also(job, store, fitted, note)
+    summary["timing_s"]["formats"] = time.monotonic() - clock.written
     if job.report:
-        write_report(read_result(job.out), job.out)
-        end = time.monotonic()
-        summary["timing_s"]["report"] = end - clock.written
-        summary["wall_s"] = end - clock.began
-        write_json(job.out / SUMMARY, summary)
+        _report(job, source, summary, found.frames, progress)
+    write_json(job.out / SUMMARY, summary)
     store.remove()
     return summary, problems
 
@@ -284,6 +289,11 @@ class _Source:
         return root_motions(measured, store, sides)
 
     @property
+    def recording(self) -> Recording | None:
+        """What was opened; None of a marker table."""
+        return self._recording
+
+    @property
     def reading_s(self) -> float | None:
         """How long reading the frames takes by itself; None when there were none, or others read them."""
         if self._recording is None or self._job.scheduler is not None:
@@ -321,6 +331,20 @@ def _plan(job: Job, wing: Wing, source: _Source) -> FitPlan:
     return plan
 
 
+def _report(job: Job, source: "_Source", summary: dict[str, Any], frames: pa.Table, progress: Progress) -> None:
+    """Draw the report, and the film; adds to ``summary`` how long that took."""
+    began = time.monotonic()
+    if source.recording is not None:
+        shown = moments(frames, window_ns(job.reference, int(frames.column("timestamp_ns").to_numpy().min())))
+        write_frame_pictures(source.recording, shown, job.out, job.settings.detection)
+    result = read_result(job.out)
+    write_report(result, job.out)
+    summary["timing_s"]["report"] = time.monotonic() - began
+    if job.animation:
+        write_animation(result, job.out, _telling(progress, "film", 0.0))
+        summary["timing_s"]["animation"] = time.monotonic() - began - summary["timing_s"]["report"]
+
+
 def _write_also(job: Job, store: PartStore, fitted: Sequence[Key], note: Mapping[str, Any]) -> None:
     if "mcap" in job.also:
         write_scene(store, fitted, job.out, note)
@@ -340,6 +364,8 @@ def _telling(progress: Progress, stage: str, flight_s: float) -> Callable[[int, 
 
 def _remove_stale(job: Job) -> None:
     """A run that fails half way must not leave an older one's words."""
+    remove_frame_pictures(job.out)
+    remove_animation(job.out)
     texts = [Path(name).with_suffix(".csv").name for name in (SHAPE, FRAMES, LOADS, RESIDUALS, MARKERS, LIGHTS, AIR)]
     for stale in (LIGHTS, AIR, REPORT, SCENE, MAT, NETCDF, SUMMARY, COMPARISON, SHAPE_ERRORS, MARKER_ERRORS, *texts):
         (job.out / stale).unlink(missing_ok=True)
@@ -366,7 +392,7 @@ def _warnings(wing: Wing, sample: Mapping[str, MarkerSeries]) -> list[str]:
 
 
 def _timing(clock: _Clock, frames: pa.Table, resumed: bool, reading_s: float | None) -> dict[str, Any]:
-    """``flight_s`` over the time from the first byte read to the last row written is ``times_real_time``."""
+    """``flight_s`` over ``wall_s``, from the first byte read to the last row written, is ``times_real_time``."""
     worked_s = clock.written - clock.first_byte
     times = frames.column("timestamp_ns").to_numpy()
     flight_s = float(times.max() - times.min()) * 1e-9
@@ -377,7 +403,7 @@ def _timing(clock: _Clock, frames: pa.Table, resumed: bool, reading_s: float | N
             "fit": clock.fitted - clock.measured,
             "tables": clock.written - clock.fitted,
         },
-        "wall_s": clock.written - clock.began,
+        "wall_s": worked_s,
         "flight_s": flight_s,
         "times_real_time": None if resumed else flight_s / worked_s,
         "read_ratio": None if resumed or not reading_s else worked_s / reading_s,

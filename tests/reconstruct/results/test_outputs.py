@@ -1,6 +1,7 @@
 """What others open a result with: pandas, xarray, SciPy (for MATLAB), the stock MCAP library, Rerun; the library."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from scipy.io import loadmat, netcdf_file
 
 from capture.errors import UsageError
 from reconstruct import open_result, reconstruct
+from reconstruct.mat_file import write_mat
 
 SETS = 30
 
@@ -61,7 +63,29 @@ def test_matlab_file(out: Path) -> None:
     stations = shape.station.nunique()
     z = shape[shape.side == "right"].z_m.to_numpy().reshape(-1, stations)
     np.testing.assert_array_equal(content["right"]["shape"]["z_m"], z)
+    flags, words = content["right"]["markers"]["flags"], np.atleast_1d(content["right"]["markers"]["flags_words"])
+    markers = pd.read_parquet(out / "markers.parquet")
+    said = markers[markers.side == "right"]["flags"].to_numpy().reshape(-1, 18)
+    assert flags.shape == said.shape
+    assert all(
+        (words[code - 1] if code else "") == word for code, word in zip(flags.ravel(), said.ravel(), strict=True)
+    )
     assert "--wing" in json.loads(content["wingshape"]["made"])["command"]
+
+
+def test_matlab_file_of_a_long_flight_is_cut(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Into variables of bounded size, one after the other the same as the whole."""
+    folder = shutil.copytree(out, tmp_path / "out")
+    whole = loadmat(out / "result.mat", simplify_cells=True)
+    monkeypatch.setattr("reconstruct.mat_file.LARGEST_BYTES", 150_000)
+    cut = loadmat(write_mat(folder), simplify_cells=True)
+    names = [name for name in cut if name.startswith("right")]
+    assert names == ["right", *(f"right_{number}" for number in range(2, len(names) + 1))]
+    assert len(names) > 2
+    for table, column in (("frames", "tip_dz_m"), ("shape", "z_m"), ("markers", "flags"), ("residuals", "used")):
+        pieces = [cut[name][table][column] for name in names]
+        assert max(piece.shape[0] for piece in pieces) * 15_000 < 300_000
+        np.testing.assert_array_equal(np.concatenate(pieces), whole["right"][table][column])
 
 
 def test_netcdf_file(out: Path) -> None:
