@@ -35,6 +35,7 @@ from reconstruct.summary import motion_sentence, verdict
 from reconstruct.wing import example_path
 
 SHOWN_WARNINGS = 20
+PICTURES = ("report", "film")  # stages that do not count sets
 
 
 class _RunByDefault(TyperGroup):
@@ -278,7 +279,7 @@ def _speed(summary: dict[str, Any]) -> str:
         return ""
     ratio = summary["read_ratio"]
     reading = "" if ratio is None else f", {ratio:.1f} × the time of reading alone"
-    return f" ({times:.1f} × real time without start and report{reading})"
+    return f" ({times:.1f} × real time{reading}; start, report and film apart)"
 
 
 def _command() -> str:
@@ -290,7 +291,7 @@ class _Rate(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
-        if not speed:
+        if not speed or task.description in PICTURES:
             return Text("")
         flight_s = task.fields["flight_s"]
         return Text(f"{speed:.0f} sets/s" + (f", {speed * flight_s / task.total:.1f} × real time" if flight_s else ""))

@@ -20,6 +20,9 @@ from reconstruct.result import FIGURES, REPORT, Result
 from reconstruct.summary import verdict
 from reconstruct.wing_view import wing_view
 
+Tell = Callable[[int, int], None]
+"""told how many figures are done, and how many there are"""
+
 
 @dataclass(frozen=True)
 class Plate:
@@ -146,7 +149,7 @@ COMPARED_PLATES = (
 )
 
 
-def write_report(result: Result, folder: Path) -> Path:
+def write_report(result: Result, folder: Path, tell: Tell = lambda _done, _all: None) -> Path:
     """Draw all figures into ``folder/figures`` and write ``folder/report.html``; returns its path.
 
     With ``result.comparison`` it has a section on the errors against the reference. Raises ReconstructError when no
@@ -157,7 +160,9 @@ def write_report(result: Result, folder: Path) -> Path:
     (folder / FIGURES).mkdir(parents=True, exist_ok=True)
     view = wing_view(result)
     sections: dict[str, list[str]] = {"The wing": [view.html], "Error against the reference": []}
-    for plate in (*COMPARED_PLATES, *PLATES):
+    plates = (*COMPARED_PLATES, *PLATES)
+    for done, plate in enumerate(plates):
+        tell(done, len(plates))
         file = folder / FIGURES / f"{plate.name}.png"
         file.unlink(missing_ok=True)
         if not plate.applies(result) or (plate in COMPARED_PLATES and result.comparison is None):
@@ -174,6 +179,7 @@ def write_report(result: Result, folder: Path) -> Path:
     body = [_head(result)]
     body += [f"<section><h2>{text(title)}</h2>{''.join(parts)}</section>" for title, parts in sections.items() if parts]
     body.append(_made_from(result))
+    tell(len(plates), len(plates))
     path = folder / REPORT
     path.write_text(page.page(_title(result), body, view.script), encoding="utf-8")
     return path

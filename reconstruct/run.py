@@ -65,7 +65,7 @@ class Step:
     """How far a run has got."""
 
     stage: str
-    done: int  # sets
+    done: int  # sets; figures of the report, pictures of the film
     total: int
     flight_s: float  # what they are in all, of flight
 
@@ -338,7 +338,7 @@ def _report(job: Job, source: "_Source", summary: dict[str, Any], frames: pa.Tab
         shown = moments(frames, window_ns(job.reference, int(frames.column("timestamp_ns").to_numpy().min())))
         write_frame_pictures(source.recording, shown, job.out, job.settings.detection)
     result = read_result(job.out)
-    write_report(result, job.out)
+    write_report(result, job.out, _telling(progress, "report", 0.0))
     summary["timing_s"]["report"] = time.monotonic() - began
     if job.animation:
         write_animation(result, job.out, _telling(progress, "film", 0.0))

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 
 from capture.errors import ReconstructError, UsageError
 from process.signal_table import sets_of, signal_table, signals_path
 from process.signals import Signal, Signals
 from reconstruct import figures
+from reconstruct.animation import write_animation
 from reconstruct.page import asset
 from reconstruct.report import COMPARED_PLATES, PLATES, Plate, write_report
 from reconstruct.result import read_result
@@ -242,6 +244,20 @@ def test_sums_over_the_flight_are_those_of_the_tables(result: Path) -> None:
         square = error.error_x_m**2 + error.error_y_m**2 + error.error_z_m**2
         np.testing.assert_allclose(found.errors[name].along_rms_m, np.sqrt(square.groupby(error.station).mean()))
         np.testing.assert_allclose(found.errors[name].shape_rms_m, np.sqrt(square.groupby(error.trigger_index).mean()))
+
+
+def test_a_film_is_a_gif_where_no_mp4_can_be_written(
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reconstruct.animation._write_mp4", lambda *_: False)
+    told: list[tuple[int, int]] = []
+    path = write_animation(read_result(result), tmp_path, lambda *how_far: told.append(how_far))
+    assert [one.name for one in tmp_path.iterdir()] == ["wing.gif"]
+    with Image.open(path) as film:
+        assert film.size == (640, 360)
+        assert film.n_frames >= 10  # of 12; those that look the same are one
+        assert film.info["duration"] == 40
+    assert told == [(done + 1, 12) for done in range(12)]
 
 
 @pytest.mark.slow
