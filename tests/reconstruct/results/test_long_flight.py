@@ -22,7 +22,7 @@ def test_twenty_minutes_are_drawn_in_bounded_memory(bending_wing: Any, wing_file
     table = bending_wing().marker_table(np.arange(50) * 0.04, sigma_m=1e-3, missing=0.02)
     pq.write_table(table, tmp_path / "markers.parquet")
     short, long = tmp_path / "short", tmp_path / "long"
-    run_job(Job((), None, tmp_path / "markers.parquet", wing_file, short, csv=False, also=(), report=False))
+    run_job(Job(markers=tmp_path / "markers.parquet", wing=wing_file, out=short, csv=False, also=(), report=False))
     repeat(short, long, SETS)
     program = Path(__file__).parents[2] / "support/long_result.py"
     done = subprocess.run([sys.executable, program, "--draw", long], capture_output=True, text=True, timeout=250)

@@ -32,8 +32,8 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     disks = write_flight(world, folder, SECONDS)
     true_rig(world).write(folder / "rig.json")
     out = folder / "out"
-    job = Job(disks, folder / "rig.json", None, example_path("xhale.toml"), out, csv=False, also=(), animation=True)
-    run_job(job)
+    wing = example_path("xhale.toml")
+    run_job(Job(flights=disks, rig=folder / "rig.json", wing=wing, out=out, csv=False, also=(), animation=True))
     return out
 
 
