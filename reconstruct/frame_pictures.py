@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from capture.errors import ProcessError, ReconstructError
@@ -29,6 +30,7 @@ INDEX = "frames.json"
 WIDTH_PX, QUALITY = 1100, 80  # these bound a picture to some 0.2 MB
 _GAMMA = 0.45  # dark parts of the scene are drawn brighter
 _MARGIN = 0.08  # of the frame's width, around what is drawn
+_TEXT_PX = 15.0
 _SAME_PX = 1.5  # a spot so near to a marker is the marker
 _BOTH, _ONE, _OTHER, _REJECTED = "#6fd3ff", "#ffc24a", "#c9ced3", "#ff6a5e"
 
@@ -167,9 +169,11 @@ def _draw(
     for at in np.flatnonzero(seen):
         pair = seen & (numbers // 2 == numbers[at] // 2)  # numbers stand away from the other one of the pair
         away = pixels[at] - pixels[pair].mean(axis=0)
-        canvas.circle(pixels[at], _ONE if alone[at] else _BOTH, str(numbers[at]), away if away.any() else (0.0, -1.0))
+        colour = _ONE if alone[at] else _BOTH
+        canvas.circle(pixels[at], _radius_px(found, pixels[at]), colour)
+        canvas.number(pixels[at], _radius_px(found, pixels[at]), colour, str(numbers[at]), away)
     for at in others:
-        canvas.circle(at, _OTHER, "", (0.0, -1.0))
+        canvas.circle(at, _radius_px(found, at), _OTHER)
     for spot in found.rejected:
         canvas.cross((spot.u_px, spot.v_px), spot.reason.split(":")[0])
     canvas.write(folder / name)
@@ -186,6 +190,15 @@ def _others(found: Detections, markers: Floats) -> Floats:
         return spots
     near = np.linalg.norm(spots[:, None] - markers[None], axis=-1).min(axis=1)
     return np.asarray(spots[near > _SAME_PX])
+
+
+def _radius_px(found: Detections, pixel: Any) -> float:
+    """Of the spot at ``pixel``; 0 when it was not found again."""
+    if not len(found):
+        return 0.0
+    apart = np.linalg.norm(found.pixels - pixel, axis=1)
+    nearest = int(np.argmin(apart))
+    return float(np.sqrt(found.area_px[nearest] / np.pi)) if apart[nearest] <= _SAME_PX else 0.0
 
 
 class _Canvas:
@@ -207,19 +220,26 @@ class _Canvas:
         self._axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5))
         self._axes.axis("off")
 
-    def circle(self, pixel: Any, colour: str, text: str, away: Any) -> None:
-        """``text`` stands towards ``away``."""
-        u, v = self._at(pixel)
-        self._axes.plot(u, v, "o", markersize=13, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=1.1)
-        offset = 13 * np.asarray(away) / np.linalg.norm(away) * (1, -1)
-        self._axes.annotate(
-            text, (u, v), tuple(offset), textcoords="offset points", color=colour, fontsize=10, ha="center", va="center"
+    def circle(self, pixel: Any, radius_px: float, colour: str) -> None:
+        """Around a spot of this radius."""
+        self._axes.add_patch(
+            Circle(self._at(pixel), self._around(radius_px), fill=False, edgecolor=colour, linewidth=1.2)
         )
+
+    def number(self, pixel: Any, radius_px: float, colour: str, text: str, away: Any) -> None:
+        """Beside the circle, towards ``away``; above it where that is nowhere."""
+        length = float(np.linalg.norm(away))
+        to = np.asarray(away) / length if length else np.array([0.0, -1.0])
+        place = np.array(self._at(pixel)) + (self._around(radius_px) + _TEXT_PX) * to
+        self._axes.text(*place, text, color=colour, fontsize=14, ha="center", va="center")
 
     def cross(self, pixel: Any, text: str) -> None:
         u, v = self._at(pixel)
-        self._axes.plot(u, v, "x", markersize=8, color=_REJECTED, markeredgewidth=1.3)
-        self._axes.annotate(text, (u, v), (8, 0), textcoords="offset points", color=_REJECTED, fontsize=8, va="center")
+        self._axes.plot(u, v, "x", markersize=10, color=_REJECTED, markeredgewidth=1.3)
+        self._axes.annotate(text, (u, v), (8, 0), textcoords="offset points", color=_REJECTED, fontsize=13, va="center")
+
+    def _around(self, radius_px: float) -> float:
+        return max(10.0, 1.5 * radius_px * self._scale)
 
     def write(self, path: Path) -> None:
         canvas: Any = self._figure.canvas

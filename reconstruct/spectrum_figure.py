@@ -35,7 +35,7 @@ def spectra(result: Result) -> Figure:
                 )  # fmt: skip
         axis.margins(y=0.15)
         top = axis.get_ylim()[1]
-        axis.set_ylim(max(axis.get_ylim()[0], 1e-8 * top), top)
+        axis.set_ylim(max(axis.get_ylim()[0], 1e-10 * top), top)
         axis.set(title=f"Tip {motion}", ylabel=f"{unit}²/Hz")
     axes[0].legend(loc="upper right", ncols=2)
     axes[1].set(xlabel="frequency, Hz", xlim=(0, None))
