@@ -74,7 +74,8 @@ PLATES = (
     Plate(
         "loads",
         "The wing",
-        "The loads that explain the shape (the paper's eq. 7): air, inertia and weight together, with two-sigma bands. "
+        "The loads that explain the shape (the paper's eq. 7): air, inertia and weight together, with two-sigma bands "
+        "(of a long flight: mean and range). "
         "How they are spread along the span is much less certain than their sum.",
         figures.loads,
     ),

@@ -9,6 +9,7 @@ from reconstruct.tables import Bools, Floats, Ints
 
 DETAIL_S = 20.0  # of a longer flight, so much is shown in detail
 FRAMES_SHOWN = 600  # at most, of a track: this bounds a report, whatever the flight's length
+_GOLDEN = (5**0.5 - 1) / 2
 WHOLE, DETAIL = "whole flight", "around the highest position"
 
 
@@ -42,7 +43,7 @@ class Shown:
     instants: Mapping[str, Mapping[str, int]]
     """lowest, middle and highest tip → side → trigger index; fewer when sets are few, none when no set was fitted"""
     tracks: tuple[Track, ...]
-    """the whole flight, evenly thinned; of a long one also DETAIL_S around the highest position"""
+    """the whole flight, thinned; of a long one also DETAIL_S around the highest position"""
 
     @property
     def detail(self) -> Track:
@@ -63,12 +64,14 @@ def choose(sides: Mapping[str, Heights]) -> Shown:
     times = np.concatenate([one.timestamp_ns for one in sides.values()])
     triggers, first = np.unique(triggers, return_index=True)
     times = times[first]
-    tracks = [_track(WHOLE, triggers, times)]
+    spread = _spread(triggers.size)
+    tracks = [Track(WHOLE, triggers[spread], times[spread])]
     if (times[-1] - times[0]) * 1e-9 > DETAIL_S:
         begin_ns = highest_ns(sides) - round(DETAIL_S / 2 * 1e9)
         begin_ns = min(max(begin_ns, int(times[0])), int(times[-1]) - round(DETAIL_S * 1e9))
         inside = (times >= begin_ns) & (times <= begin_ns + round(DETAIL_S * 1e9))
-        tracks.append(_track(DETAIL, triggers[inside], times[inside]))
+        every = max(1, -(-int(inside.sum()) // FRAMES_SHOWN))
+        tracks.append(Track(DETAIL, triggers[inside][::every], times[inside][::every]))
     return Shown(_instants(sides), tuple(track for track in tracks if track.trigger_index.size))
 
 
@@ -83,9 +86,15 @@ def leading(sides: Mapping[str, Heights]) -> str:
     return max(sides, key=lambda side: int(sides[side].fitted.sum()))
 
 
-def _track(name: str, triggers: Ints, times: Ints) -> Track:
-    step = max(1, -(-triggers.size // FRAMES_SHOWN))
-    return Track(name, triggers[::step], times[::step])
+def _spread(count: int) -> Ints:
+    """At most FRAMES_SHOWN of so many sets: one of each equal stretch, in it by the golden ratio.
+
+    A regular step would see a regular motion always at the same phases.
+    """
+    if count <= FRAMES_SHOWN:
+        return np.arange(count)
+    stretch = np.arange(FRAMES_SHOWN)
+    return np.unique(((stretch + stretch * _GOLDEN % 1.0) * (count / FRAMES_SHOWN)).astype(np.int64))
 
 
 def _instants(sides: Mapping[str, Heights]) -> dict[str, dict[str, int]]:

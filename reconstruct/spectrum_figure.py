@@ -29,9 +29,10 @@ def spectra(result: Result) -> Figure:
             for mode in one.modes:
                 height = np.interp(mode.frequency_hz, one.frequency_hz, one.density)
                 axis.plot(mode.frequency_hz, height, "v", color=COLOURS[side], markersize=5)
+                to = -1 if side == "left" else 1  # the two wings' are often the same
                 axis.annotate(
-                    f"{mode.frequency_hz:.2f}", (mode.frequency_hz, height), (0, 5), textcoords="offset points",
-                    ha="center", fontsize=8, color=COLOURS[side],
+                    f"{mode.frequency_hz:.2f}", (mode.frequency_hz, height), (4 * to, 4), textcoords="offset points",
+                    ha="right" if to < 0 else "left", fontsize=8, color=COLOURS[side],
                 )  # fmt: skip
         axis.margins(y=0.15)
         top = axis.get_ylim()[1]

@@ -198,6 +198,9 @@ def test_what_is_shown_of_a_long_flight_is_bounded(sets: int) -> None:
     assert detail.trigger_index.size == 501
     assert np.ptp(detail.timestamp_ns) == 20_000_000_000
     assert highest_ns(sides) in detail.timestamp_ns
+    phase = (whole_flight.trigger_index - 100) % 25  # of the motion, which is periodic
+    assert np.bincount(phase, minlength=25).min() > 0.5 * whole_flight.trigger_index.size / 25
+    assert np.diff(whole_flight.trigger_index).max() <= 2 * np.ceil(sets / FRAMES_SHOWN)
     assert choose(sides).triggers("left").size <= 2 * FRAMES_SHOWN + 3
 
 
