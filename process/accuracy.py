@@ -62,7 +62,9 @@ class TargetError:
     pixels: Array
     """(N, 2) in cam0"""
     errors_mm: Array
-    """(N, 3)"""
+    """(N, 3) in cam0's frame"""
+    papers_errors_mm: Array
+    """(N, 3) by the paper's method; NaN where it has none"""
 
 
 def read_calibrated(path: Path) -> Calibrated:
@@ -117,6 +119,7 @@ def _measure(
         float(np.median(limit)),
         mine[0],
         1000.0 * errors,
+        1000.0 * papers_errors,
     )
 
 

@@ -56,8 +56,7 @@ def accuracy(
     if len(set(focals)) < len(focals):
         raise UsageError("--focal-mm: each focal length once")
     output.mkdir(exist_ok=True)
-    tables: dict[str, list[dict[str, Any]]] = {"table5": [], "table6": [], "table7": []}
-    examples = {}
+    tables: dict[str, list[dict[str, Any]]] = {"table5": [], "table6": [], "table7": [], "figure10": []}
     for focal in focals:
         runs = []
         for number in range(calibrations):
@@ -66,7 +65,7 @@ def accuracy(
         tables["table5"] += _table5(focal, [(ours, papers) for ours, papers, _ in runs])
         for table, kind in (("table6", "board"), ("table7", "lights")):
             tables[table] += _rows(focal, kind, [errors for _, _, errors in runs])
-        examples[focal] = runs[0][2]
+        tables["figure10"] += _by_place(focal, runs[0][2])
     result = {
         "calibrations": calibrations,
         "seed": seed,
@@ -75,7 +74,7 @@ def accuracy(
     }
     write_json(output / "accuracy.json", result)
     (output / "accuracy.md").write_text(markdown(tables, calibrations), encoding="utf-8")
-    write_plots(output / "accuracy.png", tables, examples)
+    write_plots(output / "accuracy.png", tables)
     if json:
         say_json(result)
     else:
@@ -130,6 +129,22 @@ def _table5(focal_mm: float, pairs: list[tuple[Calibrated, Calibrated]]) -> list
             "ours_px": float(np.median([ours.rms_px[index] for ours, _ in pairs])),
         }
         for index, source in enumerate(SOURCES)
+    ]
+
+
+def _by_place(focal_mm: float, errors: list[TargetError]) -> list[dict[str, Any]]:
+    """One row a point of one calibration's targets: its place in cam0's image and what it is wrong by."""
+    return [
+        {
+            "focal_mm": focal_mm,
+            "kind": error.kind,
+            "z_mm": error.z_mm,
+            "uv_px": [finite_or_none(float(value)) for value in pixel],
+            "baseline_xyz_mm": [finite_or_none(float(value)) for value in theirs],
+            "ours_xyz_mm": [finite_or_none(float(value)) for value in ours],
+        }
+        for error in errors
+        for pixel, theirs, ours in zip(error.pixels, error.papers_errors_mm, error.errors_mm, strict=True)
     ]
 
 

@@ -7,16 +7,17 @@ import pytest
 from typer.testing import CliRunner
 
 from capture.errors import ProcessError, UsageError
-from process.accuracy import TargetError, _aligned, _drawn_mm
+from process.accuracy import BOARD, TargetError, _aligned, _drawn_mm
 from process.accuracy_command import _rows
 from process.accuracy_report import markdown
 from process.camera_model import StereoPair
 from process.cli import app
+from process.plan import CORNER_SIGMA_PX, Mount, calibrated, ideal_pair
 from process.shared_error import triangulated_by_calibration
 
 
 def error(z_mm: float, ours_mm: float, baseline_mm: float = 5.0) -> TargetError:
-    nothing = np.empty((0, 2)), np.empty((0, 3))
+    nothing = np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3))
     return TargetError("board", z_mm, baseline_mm, ours_mm, 0.05, 0.1, 0.3, 0.2, *nothing)
 
 
@@ -26,7 +27,7 @@ def test_rows_are_medians_over_runs_of_what_all_of_them_saw():
     assert (row["z_mm"], row["paper_mm"]) == (2000, 4.4)
     assert (row["ours_mm"], row["ours_worst_mm"], row["within_bound95"]) == (0.2, 0.5, 2)
     assert row["baseline_mm"] is None  # one run did not find it
-    assert "| 6.75 | 2000 | 4.40 | – | 0.200 | 0.500 |" in markdown(
+    assert "| 6.75 | 2000 | 4.40 | – | 0.200 | 0.500 | 0.050 | 0.100 | 0.300 | 2 | 0.200 |" in markdown(
         {"table5": [], "table6": [row], "table7": []}, calibrations=3
     )
 
@@ -68,8 +69,25 @@ def test_the_papers_table_at_two_metres(tmp_path):
         assert row["ours_aligned_mm"] < 0.1
         assert 0.5 < row["baseline_mm"] < 30.0
         assert row["crlb_mm"] < row["bound95_mm"]
+        assert row["bound95_mm"] == pytest.approx(
+            planned_bound95_mm(table == "table6"), rel=0.5
+        )  # its views are others
+    by_place = [row for row in tables["figure10"] if row["kind"] == "board"]
+    assert len(by_place) == 70
+    mean_mm = np.linalg.norm([row["ours_xyz_mm"] for row in by_place], axis=1).mean()
+    assert mean_mm == pytest.approx(tables["table6"][0]["ours_mm"])
     assert (out / "accuracy.png").stat().st_size > 10_000
     assert not (out / "f6.75_100" / "target").exists()
+
+
+def planned_bound95_mm(board: bool) -> float:
+    """What `wingproc plan` makes of the same: 15 views of the same board, before there is a camera."""
+    planned = Mount(6.75, 2.5, (2080, 1552), 0.2794, (0.03, -0.2, 0.08), (0.0, 0.99, 0.14))
+    pair = calibrated(ideal_pair(planned), BOARD, 15)
+    flat = BOARD.points_m if board else np.array([[0.12, 0.12], [0.0, 0.0], [-0.12, -0.12]])
+    points = np.column_stack([flat[:, 0] + 0.14, flat[:, 1], np.full(len(flat), 2.0)])
+    noise = np.broadcast_to(np.eye(2) * CORNER_SIGMA_PX**2, (len(points), 2, 2))
+    return float(np.percentile(_drawn_mm(pair, 1.0, points, [noise, noise], np.random.default_rng(1)), 95))
 
 
 def test_wrong_options_are_refused(tmp_path):
