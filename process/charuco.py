@@ -21,6 +21,8 @@ LEAST_PART = 0.2  # of the board's corners
 LEAST_RADIUS_PX = 3.0
 MOST_RADIUS_PX = 10.0
 CLEAR_PART = 0.9  # of the way from a corner to the nearest marker
+_VERSION = tuple(int(part) for part in cv2.__version__.split(".")[:2])
+LIBRARY_SHIFT_PX = 0.5 if _VERSION < (4, 14) else 0.0  # to the right and down, of the corners of OpenCV's detector
 
 
 def find_charuco(path: Path, image: Image, board: Board) -> View:
@@ -54,7 +56,7 @@ def _by_opencv(image: Image, board: Board) -> Array:
         if numbers is None:
             continue
         places = np.full((board.corners, 2), np.nan)
-        places[np.asarray(numbers).ravel()] = np.asarray(corners, np.float64).reshape(-1, 2)
+        places[np.asarray(numbers).ravel()] = np.asarray(corners, np.float64).reshape(-1, 2) - LIBRARY_SHIFT_PX
         if np.isfinite(places).sum() > np.isfinite(best).sum():
             best = places
     return best
