@@ -24,6 +24,7 @@ FILMS = ("wing.mp4", "wing.gif")
 SIZE_PX = (1280, 720)
 GIF_SIZE_PX = (640, 360)
 MOST_RATE_HZ = 30.0
+LEAST_BYTES = 1000  # one picture has more
 _YAW_RAD, _PITCH_RAD = np.radians(-22.0), np.radians(16.0)  # as the report's view begins
 Pixels = NDArray[np.uint8]
 Tell = Callable[[int, int], None]
@@ -72,6 +73,8 @@ def _write_mp4(path: Path, frames: Iterator[Pixels], rate_hz: float) -> bool:
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGBA2BGR))
     finally:
         writer.release()
+    if not path.is_file() or path.stat().st_size < LEAST_BYTES:  # OpenCV does not tell of a full disk
+        raise OSError("the encoder left nothing; is the disk full?")
     return True
 
 

@@ -305,7 +305,7 @@ def _ledger(result: Result) -> str:
         rows.append(("triggers without this wing's set", name, absent, result.summary["triggers"]))
         for flag, count in _most(side.health.flags):
             rows.append((f"marker: {flag}", name, count, side.health.rows))
-        for kind, words in (("set", "flags"), ("set not fitted", "reason"), ("failing then", "gates_failing")):
+        for kind, words in (("set", "flags"), ("set not fitted", "reason"), ("gate failing", "gates_failing")):
             for word, count in _most(side.words.get(words, {})):
                 rows.append((f"{kind}: {word}", name, count, sets))
     shown = [(what, name, count, total, f"{100 * count / total:.2f} %") for what, name, count, total in rows]  # type: ignore[operator]

@@ -168,10 +168,7 @@ def run_job(
         _remove_stale(job)
         target = Target(job.out, job.csv, note, source.rig, source.beside, source.has_lights)
         found = assemble(store, measured, fitted, target)
-        if job.specific_force is not None:
-            air = air_table(wing, job.out / SHAPE, found.frames, job.specific_force)
-            with TableWriter(job.out / AIR, air.schema, note, csv=job.csv) as writer:
-                writer.append(air)
+        _write_air(job, wing, found.frames, note)
         clock.written = time.monotonic()
     hangs = recorded_hangs(wing, found.wings)
     summary = {
@@ -199,8 +196,9 @@ def run_job(
     if not summary["converged_percent"]:
         reason = found.frames.column("reason")[0].as_py()
         raise ReconstructError(f"{source.name}: no set could be fitted ({reason}); see {job.out / FRAMES}")
+    began = time.monotonic()
     _write_also(job, store, fitted, note)
-    summary["timing_s"]["formats"] = time.monotonic() - clock.written
+    summary["timing_s"]["formats"] = time.monotonic() - began
     if job.report:
         _report(job, source, summary, found.frames, progress)
     write_json(job.out / SUMMARY, summary)
@@ -331,7 +329,15 @@ def _plan(job: Job, wing: Wing, source: _Source) -> FitPlan:
     return plan
 
 
-def _report(job: Job, source: "_Source", summary: dict[str, Any], frames: pa.Table, progress: Progress) -> None:
+def _write_air(job: Job, wing: Wing, frames: pa.Table, note: Mapping[str, Any]) -> None:
+    """Aerodynamic loads, where they are asked for."""
+    if job.specific_force is not None:
+        air = air_table(wing, job.out / SHAPE, frames, job.specific_force)
+        with TableWriter(job.out / AIR, air.schema, note, csv=job.csv) as writer:
+            writer.append(air)
+
+
+def _report(job: Job, source: _Source, summary: dict[str, Any], frames: pa.Table, progress: Progress) -> None:
     """Draw the report, and the film; adds to ``summary`` how long that took."""
     began = time.monotonic()
     if source.recording is not None:
