@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ Indices = NDArray[np.intp]
 MAX_BLOBS = 400
 """Beyond these the scene is not a dark one with lights: the largest are kept, the rest counted as rejected."""
 OUTLINE_AREA_PX = 40  # smaller blobs have no outline to speak of
-_STRIDE = 16  # of the sample that the background is estimated from
+_TILE = 16  # pixels on each side; the background is sampled once in each
 _LEVELS = (0.5, 0.7, 0.85)  # of a blob's peak, where two lights that run into each other part
 _SHAPE_FLAT_PX2 = 0.15  # added to both second moments: a few pixels do not have a shape
 
@@ -33,18 +34,36 @@ class Scene:
     """The image above its background."""
 
     image: Pixels
-    light: Pixels
-    """grey levels above the threshold's base"""
+    smooth: Pixels | None
+    """background (tiles down, tiles across) where it varies: light is counted from it; None: from 0"""
     floor: float
-    """grey levels that ``light`` still has of background"""
+    """grey levels that light still has of background"""
     sigma: float
     """noise of the background"""
     threshold: float
+    """grey levels of light"""
     rejected: list[Rejected] = field(default_factory=list)
 
     def reject(self, u: float, v: float, reason: str) -> None:
         """Note that a blob is turned down."""
         self.rejected.append(Rejected(float(u), float(v), reason))
+
+    def light(self, rows: Indices, columns: Indices) -> NDArray[np.intp]:
+        """Grey levels of pixels above the background, where it varies."""
+        grey = self.image[rows, columns].astype(np.intp)
+        return grey if self.smooth is None else np.maximum(grey - self.background(rows, columns), 0)
+
+    def background(self, rows: Indices, columns: Indices) -> NDArray[np.intp]:
+        """Grey levels of background at pixels; ``floor`` where it does not vary."""
+        if self.smooth is None:
+            return np.full(np.broadcast_shapes(rows.shape, columns.shape), round(self.floor), dtype=np.intp)
+        (above, below, down), (left, right, across) = (
+            _between(places, size) for places, size in zip((rows, columns), self.smooth.shape, strict=True)
+        )
+        grid = self.smooth.astype(np.float64)
+        upper = grid[above, left] * (1.0 - across) + grid[above, right] * across
+        lower = grid[below, left] * (1.0 - across) + grid[below, right] * across
+        return np.asarray(np.rint(upper * (1.0 - down) + lower * down).astype(np.intp))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,65 +99,140 @@ class Blobs:
 
 
 def scene_of(image: Pixels, contrast: float) -> Scene:
-    """Background and noise from every 16th pixel of every 16th row; a background that varies is subtracted.
+    """Background and noise from two pixels of every tile; a background that varies is subtracted.
 
     The threshold is ``contrast`` grey levels above the background, or 6 σ of its noise if that is more.
     """
-    sample = np.ascontiguousarray(image[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE])
+    sample = np.ascontiguousarray(image[_TILE // 2 :: _TILE, _TILE // 2 : -1 : _TILE])
+    beside = np.ascontiguousarray(image[_TILE // 2 :: _TILE, _TILE // 2 + 1 :: _TILE])
     smooth = cv2.medianBlur(sample, 5) if min(sample.shape) >= 5 else np.full_like(sample, int(np.median(sample)))
     # neighbours differ by noise alone wherever the scene is smooth; the clip keeps edges and lights out of it
-    first, second = image[::_STRIDE, :-1:_STRIDE], image[::_STRIDE, 1::_STRIDE]
-    steps = np.bincount(cv2.absdiff(np.ascontiguousarray(first), np.ascontiguousarray(second)).ravel(), minlength=256)
+    steps = _histogram(cv2.absdiff(sample, beside))
     bound = max(4.0, 6.0 * _quantile(steps, 0.5))
     sigma = max(0.6, float(steps @ np.minimum(np.arange(256.0), bound)) / steps.sum() * np.sqrt(np.pi) / 2.0)
     threshold = max(contrast, 6.0 * sigma)
-    levels = np.bincount(smooth.ravel(), minlength=256)
+    levels = _histogram(smooth)
     if _quantile(levels, 0.98) - _quantile(levels, 0.02) <= threshold / 3.0:
-        floor = _quantile(np.bincount(sample.ravel(), minlength=256), 0.5)
-        return Scene(image, image, floor, sigma, floor + threshold)
-    background = cv2.resize(smooth, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
-    return Scene(image, cv2.subtract(image, background), 0.0, sigma, threshold)
+        floor = _quantile(_histogram(sample), 0.5)
+        return Scene(image, None, floor, sigma, floor + threshold)
+    return Scene(image, smooth, 0.0, sigma, threshold)
 
 
 def find_blobs(scene: Scene, largest_radius_px: float, least_roundness: float) -> Blobs:
     """The blobs that may be lights, in the order of their rows; the others are noted in ``scene`` with a reason."""
-    rows = _lit_rows(scene)
-    if not len(rows):
+    lit_rows, lit_columns = _lit(scene)
+    if not len(lit_rows):
         return _nothing()
-    band = scene.light if len(rows) == len(scene.light) else scene.light[rows]
-    _, mask = cv2.threshold(band, int(scene.threshold), 1, cv2.THRESH_BINARY)
+    rows, v = _without_gaps(lit_rows, scene.image.shape[0])
+    columns, u = _without_gaps(lit_columns, scene.image.shape[1])
+    mask = np.zeros((len(rows), len(columns)), np.uint8)
+    mask[v, u] = 1
     contours = _contours(scene, mask)
     boxes = np.array([cv2.boundingRect(contour) for contour in contours])
-    boxes[:, 1] = rows[boxes[:, 1]]
+    boxes[:, 0], boxes[:, 1] = columns[boxes[:, 0]], rows[boxes[:, 1]]
     bad = _border_or_too_large(scene, boxes, largest_radius_px)
     contours = [contour for contour, out in zip(contours, bad, strict=True) if not out]
     if not contours:
         return _nothing()
-    members = _members(mask, contours, rows)
+    labels = np.zeros(mask.shape, np.int16)
+    for number, contour in enumerate(contours):
+        cv2.drawContours(labels, [contour], -1, number + 1, cv2.FILLED)
+    members = _members(labels[v, u], lit_rows, lit_columns, len(contours))
     blobs = _measured(scene, members, contours)
     return _gated(scene, blobs, members, largest_radius_px, least_roundness)
 
 
-def _quantile(histogram: NDArray[np.intp], part: float) -> float:
+def _between(places: Indices, size: int) -> tuple[Indices, Indices, Array]:
+    """Of pixels along one axis: the two samples of ``size`` they are between, and how far they are to the second."""
+    at = (places - _TILE // 2) / _TILE
+    first = np.clip(np.floor(at).astype(np.intp), 0, size - 1)
+    return first, np.minimum(first + 1, size - 1), np.clip(at - first, 0.0, 1.0)
+
+
+def _histogram(levels: Pixels) -> Array:
+    """(256,)"""
+    return np.asarray(cv2.calcHist([levels], [0], None, [256], [0, 256]).ravel(), np.float64)
+
+
+def _quantile(histogram: Array, part: float) -> float:
     cumulative = np.cumsum(histogram)
     return float(np.searchsorted(cumulative, part * cumulative[-1]))
 
 
+def _lit(scene: Scene) -> tuple[Indices, Indices]:
+    """Rows and columns of the pixels that reach the threshold."""
+    if scene.smooth is not None:
+        return _lit_before(scene, scene.smooth)
+    rows = _lit_rows(scene)
+    band = scene.image if len(rows) == len(scene.image) else scene.image[rows]
+    row, column = np.divmod(np.flatnonzero(band > int(scene.threshold)), scene.image.shape[1])
+    return rows[row], column
+
+
 def _lit_rows(scene: Scene) -> Indices:
-    """Rows that may reach the threshold, and those beside them: groups that are apart in the frame stay apart.
+    """Rows that may have lit pixels.
 
     The bits of all pixels of a row together are never less than its brightest, and take half the time to find.
     """
-    light, threshold = scene.light, int(scene.threshold)
-    if light.flags.c_contiguous and light.shape[1] % 8 == 0:
-        words = np.bitwise_or.reduce(light.view(np.uint64), axis=1)
-        lit = np.bitwise_or.reduce(words[:, None].view(np.uint8), axis=1) > threshold
+    image = scene.image
+    if image.flags.c_contiguous and image.shape[1] % 8 == 0:
+        words = np.bitwise_or.reduce(image.view(np.uint64), axis=1)
+        bits = np.bitwise_or.reduce(words[:, None].view(np.uint8), axis=1)
     else:
-        lit = light.max(axis=1) > threshold
-    near = lit.copy()
-    near[1:] |= lit[:-1]
-    near[:-1] |= lit[1:]
-    return np.flatnonzero(near)
+        bits = image.max(axis=1)
+    return np.flatnonzero(bits > int(scene.threshold))
+
+
+def _lit_before(scene: Scene, smooth: Pixels) -> tuple[Indices, Indices]:
+    """``_lit`` before a background that varies: only half tiles that may have lit pixels are looked into."""
+    height, width = scene.image.shape
+    half = _TILE // 2  # wide: the bytes of a word
+    brightest = _brightest(scene.image)
+    least = cv2.erode(smooth, np.ones((3, 3), np.uint8))  # between samples it is nowhere less than the least around
+    down, across = (
+        np.minimum(np.arange(size) // tile, samples - 1)
+        for size, tile, samples in zip(brightest.shape, (1, _TILE), least.shape, strict=True)
+    )
+    brightest = cv2.subtract(brightest, np.ascontiguousarray(least[down][:, across]))
+    bright = (brightest > int(scene.threshold)).view(np.uint64) != 0
+    row, column = np.divmod(np.flatnonzero(bright), bright.shape[1])
+    rows, columns = row[:, None] * _TILE + np.arange(_TILE), column[:, None] * half + np.arange(half)
+    inside = np.minimum(rows, height - 1)[:, :, None], np.minimum(columns, width - 1)[:, None, :]
+    there = scene.light(*inside) > int(scene.threshold)
+    there &= (rows < height)[:, :, None] & (columns < width)[:, None, :]
+    tile, down, across = np.nonzero(there)
+    return rows[tile, down], columns[tile, across]
+
+
+def _brightest(image: Pixels) -> Pixels:
+    """(rows of tiles, columns) the brightest pixel of each column of each tile; columns filled up to half tiles.
+
+    In halves, so that the image is read from its beginning to its end.
+    """
+    height, width = image.shape
+    brightest = np.zeros((-(-height // _TILE), -(-width // (_TILE // 2)) * (_TILE // 2)), np.uint8)
+    whole = height // _TILE
+    rows = image[: whole * _TILE].reshape(whole, _TILE, width)
+    count = _TILE
+    while count > 1:
+        count //= 2
+        rows = np.maximum(rows[:, :count], rows[:, count:])
+    brightest[:whole, :width] = rows[:, 0]
+    if whole < len(brightest):
+        brightest[whole, :width] = image[whole * _TILE :].max(axis=0)
+    return brightest
+
+
+def _without_gaps(places: Indices, size: int) -> tuple[Indices, Indices]:
+    """Rows (or columns) that have lit pixels, and those beside them; and which of these each of ``places`` is.
+
+    Groups that are apart in the frame stay apart.
+    """
+    near = np.zeros(size + 2, dtype=bool)
+    for beside in range(3):
+        near[places + beside] = True
+    near = near[1:-1]
+    return np.flatnonzero(near), (np.cumsum(near) - 1)[places]
 
 
 def _contours(scene: Scene, mask: Pixels) -> list[NDArray[np.int32]]:
@@ -164,18 +258,12 @@ def _border_or_too_large(scene: Scene, boxes: NDArray[np.intp], largest_radius_p
     return np.asarray(border | large)
 
 
-def _members(mask: Pixels, contours: Sequence[NDArray[np.int32]], rows: Indices) -> list[tuple[Indices, Indices]]:
-    """Columns and rows in the frame of each group's pixels; ``rows`` are the frame's rows that ``mask`` consists of."""
-    labels = np.zeros(mask.shape, np.int16)
-    for number, contour in enumerate(contours):
-        cv2.drawContours(labels, [contour], -1, number + 1, cv2.FILLED)
-    where = np.flatnonzero(mask.view(bool))
-    label = labels.reshape(-1)[where]
+def _members(label: NDArray[np.int16], rows: Indices, columns: Indices, count: int) -> list[tuple[Indices, Indices]]:
+    """Columns and rows of each group's pixels: those labelled 1 to ``count``."""
     order = np.argsort(label, kind="stable")
-    v, u = np.divmod(where[order], mask.shape[1])
-    ends = np.cumsum(np.bincount(label, minlength=len(contours) + 1))  # the first are of groups that are out
-    v = rows[v]
-    return [(u[begin:end], v[begin:end]) for begin, end in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)]
+    u, v = columns[order], rows[order]
+    ends = np.cumsum(np.bincount(label, minlength=count + 1)).tolist()  # the first are of groups that are out
+    return [(u[begin:end], v[begin:end]) for begin, end in pairwise(ends)]
 
 
 def _measured(scene: Scene, members: Sequence[tuple[Indices, Indices]], contours: Sequence[NDArray[np.int32]]) -> Blobs:
@@ -183,7 +271,7 @@ def _measured(scene: Scene, members: Sequence[tuple[Indices, Indices]], contours
     counts = np.array([len(columns) for columns, _ in members])
     starts = np.cumsum(counts) - counts
     u, v = (np.concatenate([member[k] for member in members]) for k in (0, 1))
-    grey = scene.light[v, u].astype(np.float64)
+    grey = scene.light(v, u).astype(np.float64)
     light = grey - (int(scene.threshold) - 1)
     # about the first pixel: moments about the frame's corner would lose digits
     first_u, first_v = u[starts], v[starts]
@@ -247,9 +335,9 @@ def _passes(blobs: Blobs, largest_radius_px: float, least_roundness: float) -> N
 def _is_hot_pixel(scene: Scene, member: tuple[Indices, Indices], peak: float) -> bool:
     """Lenses spread light: around a real spot's brightest pixel there is as much light again."""
     columns, rows = member
-    brightest = int(np.argmax(scene.light[rows, columns]))
-    row, column = int(rows[brightest]), int(columns[brightest])
-    around = scene.light[row - 1 : row + 2, column - 1 : column + 2].astype(np.float64) - scene.floor
+    brightest = int(np.argmax(scene.light(rows, columns)))
+    near = np.arange(-1, 2)
+    around = scene.light(rows[brightest] + near[:, None], columns[brightest] + near) - scene.floor
     return bool(around.sum() - peak < 0.4 * peak + 3.0 * scene.sigma)
 
 
@@ -258,7 +346,7 @@ def _split(scene: Scene, member: tuple[Indices, Indices], peak: float) -> Blobs 
     columns, rows = member
     left, top = int(columns.min()), int(rows.min())
     own = np.zeros((int(rows.max()) - top + 1, int(columns.max()) - left + 1), np.uint8)
-    own[rows - top, columns - left] = scene.light[rows, columns]
+    own[rows - top, columns - left] = scene.light(rows, columns)
     for level in _LEVELS:
         upper = (own > scene.floor + level * peak).astype(np.uint8)
         contours, _ = cv2.findContours(upper, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

@@ -160,12 +160,11 @@ def measure_block(job: BlockJob) -> BlockResult:
     rig, settings = job.how.get()
     problems: list[str] = []
     sets = []
-    for some in _loaded(job.block.places):
-        for frames in some:
-            problems.extend(frames.problems)
-            # without any frame there is no time either: it is in the problems
-            if any(moment is not None for moment in frames.mid_exposures_ns):
-                sets.append((replace(frames, images=(None, None)), _sighted(frames, rig, settings.detection)))
+    for frames in _loaded(job.block.places):
+        problems.extend(frames.problems)
+        # without any frame there is no time either: it is in the problems
+        if any(moment is not None for moment in frames.mid_exposures_ns):
+            sets.append((replace(frames, images=(None, None)), _sighted(frames, rig, settings.detection)))
     seen, rejected = _seen(job.block.side, sets, rig, settings)
     side = rig.side(job.block.side)
     table = marker_rows(seen, side, rig.markers, settings.matching, settings.triangulation)
@@ -174,8 +173,11 @@ def measure_block(job: BlockJob) -> BlockResult:
     return BlockResult(table, len(job.block.places), tuple(problems), dict(rejected), lights)
 
 
-def _loaded(places: Sequence[SetPlaces]) -> Iterator[list[FrameSet]]:
-    """The frame sets, GROUP_SETS at a time, valid until the next; the next ones' bytes are on their way meanwhile."""
+def _loaded(places: Sequence[SetPlaces]) -> Iterator[FrameSet]:
+    """The frame sets, each valid until the next; their bytes come GROUP_SETS at a time, while the last are worked on.
+
+    Each is checked only when it is its turn: what has just been read through is still in the processor's cache.
+    """
     groups = [places[begin : begin + GROUP_SETS] for begin in range(0, len(places), GROUP_SETS)]
     with _reader("even") as one, _reader("odd") as other, ThreadPoolExecutor(1, "read-ahead") as ahead:
         waiting = ahead.submit(one.load, groups[0])
@@ -184,7 +186,8 @@ def _loaded(places: Sequence[SetPlaces]) -> Iterator[list[FrameSet]]:
             waiting.result()
             if number + 1 < len(groups):
                 waiting = ahead.submit(following.load, groups[number + 1])
-            yield [reader.read(where) for where in group]
+            for where in group:
+                yield reader.read(where)
 
 
 def _reader(name: str) -> FrameSetReader:

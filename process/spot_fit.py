@@ -8,7 +8,7 @@ which is a Gaussian for k = 0 and a disc with a soft edge at t = k for large k: 
 price of one exponential a pixel. A prior keeps the ellipse near a circle where a spot is too small to tell, and holds k
 where it is not determined. A spot is b + A f(t). Weights are the inverse variances of the
 sensor, σ_b² + g A f: background noise and shot noise (g grey levels an electron). Spots are fitted together, by
-Levenberg–Marquardt on their pixels laid end to end, some hundred at a time.
+Levenberg–Marquardt on their pixels laid end to end.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,6 @@ _LARGEST_T = 80.0  # exp(80) is far beyond every edge, and finite
 _SHAPE_WEIGHT = 25.0  # 1/σ² of the ellipse's (a − c)/(a + c) and 2d/(a + c) about zero: σ = 0.2
 _EDGE_WEIGHT = 1e-2  # 1/σ² of k about its start
 _EYE = np.eye(PARAMETERS)
-_PORTION_PX = 8192  # fitted together: what they need stays in a core's own cache
 _WORTH_KEEPING = 0.6  # share of spots that are not settled below which the others' pixels are dropped
 
 
@@ -201,17 +200,9 @@ def fit_spots(patches: Patches, start: Array, others: Array | None = None) -> Fi
     depend on which others are fitted with it.
     """
     fitted = Fit(start.copy(), np.full((len(start), 2, 2), np.nan), np.full(len(start), np.nan), start[:, 0] < -np.inf)
-    order = np.argsort(patches.counts, kind="stable")
-    portion = np.cumsum(patches.counts[order]) // _PORTION_PX
-    for members in np.split(order, np.flatnonzero(np.diff(portion)) + 1):
-        own = patches[members]
-        light = np.zeros(len(own.values)) if others is None else others[patches.pixels(members)]
-        _fit_portion(fitted, members, own, start[members], light)
-    return fitted
-
-
-def _fit_portion(fitted: Fit, spots: NDArray[np.intp], patches: Patches, start: Array, others: Array) -> None:
-    """Fill in what is ``fitted`` to some spots."""
+    spots = np.argsort(patches.counts, kind="stable")  # those with equally many pixels beside each other
+    others = np.zeros(len(patches.values)) if others is None else others[patches.pixels(spots)]
+    patches, start = patches[spots], start[spots]
     parameters = start.copy()
     prior = _prior(start)
     slopes, light = _evaluate(patches, parameters, others)
@@ -256,13 +247,14 @@ def _fit_portion(fitted: Fit, spots: NDArray[np.intp], patches: Patches, start: 
             open_ &= ~done
             left = np.count_nonzero(open_)
             if not left:
-                return
+                break
             if left < _WORTH_KEEPING * len(open_):
                 own = patches.pixels(open_)
                 others, kept, weights = others[own], kept[own], weights[own]
                 patches, here = patches[open_], _Equations(here.sums[open_])
                 spots, start, parameters, prior = spots[open_], start[open_], parameters[open_], prior[open_]
                 damping, moved, open_ = damping[open_], moved[open_], open_[open_]
+    return fitted
 
 
 def _finish(
