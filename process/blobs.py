@@ -99,15 +99,15 @@ class Blobs:
 
 
 def scene_of(image: Pixels, contrast: float) -> Scene:
-    """Background and noise from two pixels of every tile; a background that varies is subtracted.
+    """Background and noise from a few pixels of every tile; a background that varies is subtracted.
 
     The threshold is ``contrast`` grey levels above the background, or 6 σ of its noise if that is more.
     """
-    sample = np.ascontiguousarray(image[_TILE // 2 :: _TILE, _TILE // 2 : -1 : _TILE])
-    beside = np.ascontiguousarray(image[_TILE // 2 :: _TILE, _TILE // 2 + 1 :: _TILE])
+    sample = np.ascontiguousarray(image[_TILE // 2 :: _TILE, _TILE // 2 :: _TILE])
     smooth = cv2.medianBlur(sample, 5) if min(sample.shape) >= 5 else np.full_like(sample, int(np.median(sample)))
     # neighbours differ by noise alone wherever the scene is smooth; the clip keeps edges and lights out of it
-    steps = _histogram(cv2.absdiff(sample, beside))
+    first, second = image[::_TILE, :-1:_TILE], image[::_TILE, 1::_TILE]
+    steps = _histogram(cv2.absdiff(np.ascontiguousarray(first), np.ascontiguousarray(second)))
     bound = max(4.0, 6.0 * _quantile(steps, 0.5))
     sigma = max(0.6, float(steps @ np.minimum(np.arange(256.0), bound)) / steps.sum() * np.sqrt(np.pi) / 2.0)
     threshold = max(contrast, 6.0 * sigma)

@@ -8,7 +8,8 @@ which is a Gaussian for k = 0 and a disc with a soft edge at t = k for large k: 
 price of one exponential a pixel. A prior keeps the ellipse near a circle where a spot is too small to tell, and holds k
 where it is not determined. A spot is b + A f(t). Weights are the inverse variances of the
 sensor, σ_b² + g A f: background noise and shot noise (g grey levels an electron). Spots are fitted together, by
-Levenberg–Marquardt on their pixels laid end to end.
+Levenberg–Marquardt on their pixels laid end to end, in single precision about each spot's own pixel: a rounding of 1e-6
+px beside a noise of 1e-2.
 """
 
 from collections.abc import Sequence
@@ -34,6 +35,7 @@ _LARGEST_T = 80.0  # exp(80) is far beyond every edge, and finite
 _SHAPE_WEIGHT = 25.0  # 1/σ² of the ellipse's (a − c)/(a + c) and 2d/(a + c) about zero: σ = 0.2
 _EDGE_WEIGHT = 1e-2  # 1/σ² of k about its start
 _EYE = np.eye(PARAMETERS)
+_ROUNDING = 1e-5  # of χ², in single precision
 _WORTH_KEEPING = 0.6  # share of spots that are not settled below which the others' pixels are dropped
 
 
@@ -69,6 +71,18 @@ class Patches:
     def variance(self, light: Array) -> Array:
         """(K,) of each pixel, with so much ``light``."""
         return self._background_variance + self.shot_gain * np.maximum(light, 0.0)
+
+    def about(self, origin_px: Array) -> "Patches":
+        """The same, columns and rows counted from each spot's origin (N, 2), in single precision."""
+        u_px, v_px = self.spread(origin_px.T)
+        return replace(
+            self,
+            u_px=(self.u_px - u_px).astype(np.float32),
+            v_px=(self.v_px - v_px).astype(np.float32),
+            values=self.values.astype(np.float32),
+            usable=self.usable.astype(np.float32),
+            background_sigma=self.background_sigma.astype(np.float32),
+        )
 
     @cached_property
     def begins(self) -> NDArray[np.intp]:
@@ -201,8 +215,9 @@ def fit_spots(patches: Patches, start: Array, others: Array | None = None) -> Fi
     """
     fitted = Fit(start.copy(), np.full((len(start), 2, 2), np.nan), np.full(len(start), np.nan), start[:, 0] < -np.inf)
     spots = np.argsort(patches.counts, kind="stable")  # those with equally many pixels beside each other
-    others = np.zeros(len(patches.values)) if others is None else others[patches.pixels(spots)]
-    patches, start = patches[spots], start[spots]
+    origin = np.rint(start[:, :2])
+    others = np.zeros(len(patches.values), np.float32) if others is None else others[patches.pixels(spots)]
+    patches, start = patches[spots].about(origin[spots]), start[spots] - _at(origin[spots])
     parameters = start.copy()
     prior = _prior(start)
     slopes, light = _evaluate(patches, parameters, others)
@@ -228,7 +243,7 @@ def fit_spots(patches: Patches, start: Array, others: Array | None = None) -> Fi
         slopes, light = _evaluate(patches, trial, others)
         there = _equations(patches, slopes, weights)
         drop = here.chi2 + _pull(prior, parameters - start) - there.chi2 - _pull(prior, trial - start)
-        better = drop >= -1e-9 * here.chi2
+        better = drop >= -_ROUNDING * here.chi2
         moved = np.where(better, np.abs(trial - parameters)[:, :2].max(axis=1), moved)
         settled = (moved < CONVERGED_PX) & (np.abs(drop) < SETTLED_CHI2)
         at_best = bool(better.all())
@@ -243,7 +258,7 @@ def fit_spots(patches: Patches, start: Array, others: Array | None = None) -> Fi
         done = open_ & (settled | (iteration == ITERATIONS - 1))
         if done.any():
             pixels = patches.sums((kept > 0).astype(np.float64))
-            _finish(fitted, spots, done, parameters, here, prior, pixels, moved)
+            _finish(fitted, spots, done, parameters + _at(origin[spots]), here, prior, pixels, moved)
             open_ &= ~done
             left = np.count_nonzero(open_)
             if not left:
@@ -286,8 +301,8 @@ def _evaluate(patches: Patches, parameters: Array, others: Array) -> tuple[Array
     """The model's slopes by the parameters, and the residual (9, K), and the spots' own light A f (K,)."""
     table = parameters.T.copy()
     table[EDGE] = np.expm1(table[EDGE])
-    u, v, amplitude, background, uu, vv, uv, beta = patches.spread(table)
-    slopes = np.empty((PARAMETERS + 1, len(u)))
+    u, v, amplitude, background, uu, vv, uv, beta = patches.spread(table.astype(patches.values.dtype))
+    slopes = np.empty((PARAMETERS + 1, len(u)), patches.values.dtype)
     du, dv = np.subtract(patches.u_px, u, out=u), np.subtract(patches.v_px, v, out=v)
     towards_u, towards_v = uu * du, vv * dv
     towards_u += uv * dv
@@ -324,19 +339,19 @@ def _equations(patches: Patches, slopes: Array, weights: Array) -> _Equations:
     if patches.saturated is not None:
         weights = np.where(patches.saturated & (slopes[PARAMETERS] == 0.0), 0.0, weights)
     weighted = slopes * weights
-    sums = np.empty((len(patches.counts), PARAMETERS + 1, PARAMETERS + 1))
+    sums = np.empty((len(patches.counts), PARAMETERS + 1, PARAMETERS + 1), slopes.dtype)
     for spots, pixels in patches.alike:
         shape = (PARAMETERS + 1, spots.stop - spots.start, -1)
         left, right = weighted[:, pixels].reshape(shape), slopes[:, pixels].reshape(shape)
         np.matmul(left.transpose(1, 0, 2), right.transpose(1, 2, 0), out=sums[spots])
-    return _Equations(sums)
+    return _Equations(sums.astype(np.float64))
 
 
 def _own_light(patches: Patches, parameters: Array, residual: Array, light: Array, others: Array) -> Array:
     """(K,) usable pixels but those beside the spot that are 3 σ brighter than it makes them: faint shine."""
     beside = light < 0.25 * patches.spread(parameters[:, AMPLITUDE])
     foreign = beside & (residual > 3.0 * np.sqrt(patches.variance(light + others)))
-    return np.where(foreign, 0.0, patches.usable)
+    return np.where(foreign, np.float32(0.0), patches.usable)
 
 
 def _prior(start: Array) -> Array:
@@ -353,6 +368,11 @@ def _prior(start: Array) -> Array:
 
 def _pull(prior: Array, change: Array) -> Array:
     return np.asarray(np.sum(_times(prior, change) * change, axis=1))
+
+
+def _at(origin_px: Array) -> Array:
+    """(N, 8) what places (N, 2) are of parameters."""
+    return np.pad(origin_px, ((0, 0), (0, PARAMETERS - 2)))
 
 
 def _times(matrices: Array, vectors: Array) -> Array:
