@@ -1,8 +1,7 @@
-"""A frame to its blobs: connected groups of pixels above the background, measured, gated, parted where two meet."""
+"""Frames to their blobs: connected groups of pixels above the background, measured, gated, parted where two meet."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -67,6 +66,33 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
+class Groups:
+    """N connected groups of lit pixels, K in all, group by group."""
+
+    rows: Indices
+    """(K,)"""
+    columns: Indices
+    """(K,)"""
+    grey: NDArray[np.intp]
+    """(K,) grey levels of light"""
+    counts: Indices
+    """(N,) pixels of each"""
+    perimeter_px: Array
+    """(N,) of the outline; NaN for those that have none to speak of"""
+
+    @property
+    def begins(self) -> Indices:
+        """(N,) each group's first pixel."""
+        return np.cumsum(self.counts) - self.counts
+
+    @classmethod
+    def join(cls, parts: Sequence["Groups"]) -> "Groups":
+        """All of ``parts``, at least one, in their order."""
+        names = ("rows", "columns", "grey", "counts", "perimeter_px")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
 class Blobs:
     """N groups of pixels above the threshold."""
 
@@ -118,28 +144,81 @@ def scene_of(image: Pixels, contrast: float) -> Scene:
     return Scene(image, smooth, 0.0, sigma, threshold)
 
 
-def find_blobs(scene: Scene, largest_radius_px: float, least_roundness: float) -> Blobs:
-    """The blobs that may be lights, in the order of their rows; the others are noted in ``scene`` with a reason."""
-    lit_rows, lit_columns = _lit(scene)
-    if not len(lit_rows):
-        return _nothing()
-    rows, v = _without_gaps(lit_rows, scene.image.shape[0])
-    columns, u = _without_gaps(lit_columns, scene.image.shape[1])
-    mask = np.zeros((len(rows), len(columns)), np.uint8)
+def lit_groups(scene: Scene) -> Groups:
+    """The connected groups of pixels that reach the threshold, by their rows; the largest ones if there are many."""
+    rows, columns = _lit(scene)
+    place_v, v = _without_gaps(rows, scene.image.shape[0])
+    place_u, u = _without_gaps(columns, scene.image.shape[1])
+    mask = np.zeros((max(1, place_v), max(1, place_u)), np.uint8)
     mask[v, u] = 1
-    contours = _contours(scene, mask)
-    boxes = np.array([cv2.boundingRect(contour) for contour in contours])
-    boxes[:, 0], boxes[:, 1] = columns[boxes[:, 0]], rows[boxes[:, 1]]
-    bad = _border_or_too_large(scene, boxes, largest_radius_px)
-    contours = [contour for contour, out in zip(contours, bad, strict=True) if not out]
-    if not contours:
-        return _nothing()
-    labels = np.zeros(mask.shape, np.int16)
-    for number, contour in enumerate(contours):
-        cv2.drawContours(labels, [contour], -1, number + 1, cv2.FILLED)
-    members = _members(labels[v, u], lit_rows, lit_columns, len(contours))
-    blobs = _measured(scene, members, contours)
-    return _gated(scene, blobs, members, largest_radius_px, least_roundness)
+    _, labels = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
+    label = labels[v, u] - 1
+    counts = np.bincount(label)
+    if len(counts) > MAX_BLOBS:
+        beyond = len(counts) - MAX_BLOBS
+        scene.reject(np.nan, np.nan, f"crowded: {beyond} blobs beyond the {MAX_BLOBS} largest")
+        largest = np.sort(np.argsort(-counts, kind="stable")[:MAX_BLOBS])
+        renumbered = np.full(len(counts), MAX_BLOBS)
+        renumbered[largest] = np.arange(MAX_BLOBS)
+        label, counts = renumbered[label], counts[largest]
+    order = np.argsort(label, kind="stable")[: counts.sum()]
+    rows, columns = rows[order], columns[order]
+    groups = Groups(rows, columns, scene.light(rows, columns), counts, np.full(len(counts), np.nan))
+    if (counts > OUTLINE_AREA_PX).any():
+        number_of = np.full(labels.shape, -1)
+        number_of[v[order], u[order]] = label[order]
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        for contour in contours:
+            number = number_of[contour[0, 0, 1], contour[0, 0, 0]]
+            if number >= 0 and counts[number] > OUTLINE_AREA_PX:
+                groups.perimeter_px[number] = cv2.arcLength(contour, True)
+    return groups
+
+
+def find_blobs(
+    scenes: Sequence[Scene], found: Sequence[Groups], largest_radius_px: float, least_roundness: float
+) -> tuple[Blobs, Indices]:
+    """The blobs that may be lights, and how many in each scene; the others are noted in theirs with a reason.
+
+    ``found`` are the groups of each scene. All are measured together, which is faster than one by one.
+    """
+    groups = Groups.join(found)
+    of_scene = np.repeat(np.arange(len(scenes)), [len(own.counts) for own in found])
+    if not len(of_scene):
+        return _nothing(), np.zeros(len(scenes), dtype=np.intp)
+    blobs = _measured(
+        groups,
+        np.array([int(scene.threshold) - 1 for scene in scenes])[of_scene],
+        np.array([scene.floor for scene in scenes])[of_scene],
+    )
+    out = _border_or_too_large(scenes, of_scene, groups, largest_radius_px)
+    passed = _passes(blobs, largest_radius_px, least_roundness)
+    oblong = (blobs.roundness < 0.85) & (blobs.area_px >= 6)
+    keep = ~out
+    parted, parted_of = [], []
+    for number in np.flatnonzero(keep & ((blobs.area_px <= 3) | oblong | (passed != ""))).tolist():
+        scene, own = (
+            scenes[of_scene[number]],
+            slice(groups.begins[number], groups.begins[number] + groups.counts[number]),
+        )
+        one = groups.rows[own], groups.columns[own], groups.grey[own]
+        u, v, peak = blobs.u_px[number], blobs.v_px[number], blobs.peak[number]
+        keep[number] = False
+        if blobs.area_px[number] <= 3 and _is_hot_pixel(scene, *one, peak):
+            scene.reject(u, v, "hot pixel")
+        elif oblong[number] and (parts := _split(scene, *one, peak)) is not None:
+            reasons = _passes(parts, largest_radius_px, least_roundness)
+            for part in np.flatnonzero(reasons != "").tolist():
+                scene.reject(parts.u_px[part], parts.v_px[part], str(reasons[part]))
+            parted.append(parts[reasons == ""])
+            parted_of += [of_scene[number]] * len(parted[-1])
+        elif passed[number] != "":
+            scene.reject(u, v, str(passed[number]))
+        else:
+            keep[number] = True
+    of_scene = np.array([*of_scene[keep], *parted_of], dtype=np.intp)
+    order = np.argsort(of_scene, kind="stable")
+    return Blobs.join([blobs[keep], *parted])[order], np.bincount(of_scene, minlength=len(scenes))
 
 
 def _between(places: Indices, size: int) -> tuple[Indices, Indices, Array]:
@@ -223,103 +302,51 @@ def _brightest(image: Pixels) -> Pixels:
     return brightest
 
 
-def _without_gaps(places: Indices, size: int) -> tuple[Indices, Indices]:
-    """Rows (or columns) that have lit pixels, and those beside them; and which of these each of ``places`` is.
+def _without_gaps(places: Indices, size: int) -> tuple[int, Indices]:
+    """How many rows (or columns) have lit pixels, or are beside such, and which of these each of ``places`` is.
 
     Groups that are apart in the frame stay apart.
     """
     near = np.zeros(size + 2, dtype=bool)
     for beside in range(3):
         near[places + beside] = True
-    near = near[1:-1]
-    return np.flatnonzero(near), (np.cumsum(near) - 1)[places]
+    numbers = np.cumsum(near[1:-1])
+    return int(numbers[-1]), numbers[places] - 1
 
 
-def _contours(scene: Scene, mask: Pixels) -> list[NDArray[np.int32]]:
-    """Outlines of the connected groups of ``mask``; the largest ones if there are many."""
-    found, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    contours = [contour.reshape(-1, 2) for contour in reversed(found)]  # OpenCV begins at the bottom
-    if len(contours) > MAX_BLOBS:
-        contours.sort(key=lambda contour: -len(contour))
-        scene.reject(np.nan, np.nan, f"crowded: {len(contours) - MAX_BLOBS} blobs beyond the {MAX_BLOBS} largest")
-        contours = contours[:MAX_BLOBS]
-    return contours
-
-
-def _border_or_too_large(scene: Scene, boxes: NDArray[np.intp], largest_radius_px: float) -> NDArray[np.bool_]:
-    """(N,) whether a blob of box (x, y, width, height) is turned down by it."""
-    rows, columns = scene.image.shape
-    x, y, width, height = boxes.T
-    border = (x == 0) | (y == 0) | (x + width == columns) | (y + height == rows)
-    large = np.maximum(width, height) > 4 * largest_radius_px
+def _border_or_too_large(
+    scenes: Sequence[Scene], of_scene: Indices, groups: Groups, largest_radius_px: float
+) -> NDArray[np.bool_]:
+    """(N,) whether a group is turned down by its extent."""
+    top, left = (np.minimum.reduceat(places, groups.begins) for places in (groups.rows, groups.columns))
+    bottom, right = (np.maximum.reduceat(places, groups.begins) for places in (groups.rows, groups.columns))
+    rows, columns = np.array([scene.image.shape for scene in scenes])[of_scene].T
+    border = (left == 0) | (top == 0) | (right + 1 == columns) | (bottom + 1 == rows)
+    large = np.maximum(right - left, bottom - top) + 1 > 4 * largest_radius_px
     for number in np.flatnonzero(border | large).tolist():
         reason = "border" if border[number] else "too large"
-        scene.reject(x[number] + (width[number] - 1) / 2, y[number] + (height[number] - 1) / 2, reason)
+        scenes[of_scene[number]].reject((left + right)[number] / 2, (top + bottom)[number] / 2, reason)
     return np.asarray(border | large)
 
 
-def _members(label: NDArray[np.int16], rows: Indices, columns: Indices, count: int) -> list[tuple[Indices, Indices]]:
-    """Columns and rows of each group's pixels: those labelled 1 to ``count``."""
-    order = np.argsort(label, kind="stable")
-    u, v = columns[order], rows[order]
-    ends = np.cumsum(np.bincount(label, minlength=count + 1)).tolist()  # the first are of groups that are out
-    return [(u[begin:end], v[begin:end]) for begin, end in pairwise(ends)]
-
-
-def _measured(scene: Scene, members: Sequence[tuple[Indices, Indices]], contours: Sequence[NDArray[np.int32]]) -> Blobs:
-    """Moments of the light above the threshold over the pixels of each group."""
-    counts = np.array([len(columns) for columns, _ in members])
-    starts = np.cumsum(counts) - counts
-    u, v = (np.concatenate([member[k] for member in members]) for k in (0, 1))
-    grey = scene.light(v, u).astype(np.float64)
-    light = grey - (int(scene.threshold) - 1)
+def _measured(groups: Groups, base: NDArray[np.intp], floor: Array) -> Blobs:
+    """Moments of the light above ``base`` over the pixels of each group; ``floor`` (N,) is its background."""
+    counts, starts = groups.counts, groups.begins
+    light = (groups.grey - np.repeat(base, counts)).astype(np.float64)
     # about the first pixel: moments about the frame's corner would lose digits
-    first_u, first_v = u[starts], v[starts]
-    du, dv = u - np.repeat(first_u, counts), v - np.repeat(first_v, counts)
+    first_u, first_v = groups.columns[starts], groups.rows[starts]
+    du, dv = groups.columns - np.repeat(first_u, counts), groups.rows - np.repeat(first_v, counts)
     lu, lv = light * du, light * dv
     m00, m10, m01, m20, m11, m02 = np.add.reduceat(np.stack([light, lu, lv, lu * du, lu * dv, lv * dv]), starts, axis=1)
     mean_u, mean_v = m10 / m00, m01 / m00
     a, b, c = m20 / m00 - mean_u**2, m11 / m00 - mean_u * mean_v, m02 / m00 - mean_v**2
     middle, half = (a + c) / 2, np.hypot((a - c) / 2, b)
     roundness = np.sqrt((np.maximum(middle - half, 0.0) + _SHAPE_FLAT_PX2) / (middle + half + _SHAPE_FLAT_PX2))
-    circularity = np.ones(len(counts))
-    for number in np.flatnonzero(counts > OUTLINE_AREA_PX).tolist():
-        perimeter = cv2.arcLength(contours[number], True)
-        circularity[number] = 4.0 * np.pi * counts[number] / perimeter**2 if perimeter > 0 else 1.0
-    peak = np.maximum.reduceat(grey, starts) - scene.floor
+    outlined = groups.perimeter_px > 0.0
+    perimeter_px = np.where(outlined, groups.perimeter_px, 1.0)
+    circularity = np.where(outlined, 4.0 * np.pi * counts / perimeter_px**2, 1.0)
+    peak = np.maximum.reduceat(groups.grey, starts) - floor
     return Blobs(mean_u + first_u, mean_v + first_v, counts.astype(np.float64), peak, roundness, circularity)
-
-
-def _gated(
-    scene: Scene,
-    blobs: Blobs,
-    members: Sequence[tuple[Indices, Indices]],
-    largest_radius_px: float,
-    least_roundness: float,
-) -> Blobs:
-    """The light, or the lights, that each blob is; none with a reason in ``scene`` if it is not one."""
-    passed = _passes(blobs, largest_radius_px, least_roundness)
-    oblong = (blobs.roundness < 0.85) & (blobs.area_px >= 6)
-    unclear = np.flatnonzero((blobs.area_px <= 3) | oblong | (passed != ""))
-    if not len(unclear):
-        return blobs
-    keep = np.ones(len(blobs), dtype=bool)
-    parted = []
-    for number in unclear.tolist():
-        u, v = blobs.u_px[number], blobs.v_px[number]
-        keep[number] = False
-        if blobs.area_px[number] <= 3 and _is_hot_pixel(scene, members[number], blobs.peak[number]):
-            scene.reject(u, v, "hot pixel")
-        elif oblong[number] and (parts := _split(scene, members[number], blobs.peak[number])) is not None:
-            reasons = _passes(parts, largest_radius_px, least_roundness)
-            for part in np.flatnonzero(reasons != "").tolist():
-                scene.reject(parts.u_px[part], parts.v_px[part], str(reasons[part]))
-            parted.append(parts[reasons == ""])
-        elif passed[number] != "":
-            scene.reject(u, v, str(passed[number]))
-        else:
-            keep[number] = True
-    return Blobs.join([blobs[keep], *parted])
 
 
 def _passes(blobs: Blobs, largest_radius_px: float, least_roundness: float) -> NDArray[np.str_]:
@@ -332,21 +359,19 @@ def _passes(blobs: Blobs, largest_radius_px: float, least_roundness: float) -> N
     return np.select(conditions, ["elongated", "too large", "not round"], "")
 
 
-def _is_hot_pixel(scene: Scene, member: tuple[Indices, Indices], peak: float) -> bool:
+def _is_hot_pixel(scene: Scene, rows: Indices, columns: Indices, grey: NDArray[np.intp], peak: float) -> bool:
     """Lenses spread light: around a real spot's brightest pixel there is as much light again."""
-    columns, rows = member
-    brightest = int(np.argmax(scene.light(rows, columns)))
+    brightest = int(np.argmax(grey))
     near = np.arange(-1, 2)
     around = scene.light(rows[brightest] + near[:, None], columns[brightest] + near) - scene.floor
     return bool(around.sum() - peak < 0.4 * peak + 3.0 * scene.sigma)
 
 
-def _split(scene: Scene, member: tuple[Indices, Indices], peak: float) -> Blobs | None:
+def _split(scene: Scene, rows: Indices, columns: Indices, grey: NDArray[np.intp], peak: float) -> Blobs | None:
     """The lights that a blob falls into at a higher level; None if it is one piece at all of them."""
-    columns, rows = member
     left, top = int(columns.min()), int(rows.min())
     own = np.zeros((int(rows.max()) - top + 1, int(columns.max()) - left + 1), np.uint8)
-    own[rows - top, columns - left] = scene.light(rows, columns)
+    own[rows - top, columns - left] = grey
     for level in _LEVELS:
         upper = (own > scene.floor + level * peak).astype(np.uint8)
         contours, _ = cv2.findContours(upper, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -357,8 +382,11 @@ def _split(scene: Scene, member: tuple[Indices, Indices], peak: float) -> Blobs 
             piece = np.zeros_like(upper)
             cv2.drawContours(piece, [contour], -1, 1, cv2.FILLED)
             down, right = np.nonzero(piece & upper)
-            pieces.append((right + left, down + top))
-        parts = _measured(scene, pieces, [contour.reshape(-1, 2) for contour in contours])
+            outline_px = cv2.arcLength(contour, True) if len(down) > OUTLINE_AREA_PX else np.nan
+            size, outline = np.array([len(down)]), np.array([outline_px])
+            pieces.append(Groups(down + top, right + left, own[down, right].astype(np.intp), size, outline))
+        base, floor = np.full(len(pieces), int(scene.threshold) - 1), np.full(len(pieces), scene.floor)
+        parts = _measured(Groups.join(pieces), base, floor)
         # a ripple of the noise on a flat top is not a light of its own
         parts = parts[(parts.peak > level * peak + 4.0 * scene.sigma + 3.0) | (parts.area_px > 4)]
         if len(parts) > 1:

@@ -1,6 +1,6 @@
 """A frame to its light spots: sub-pixel centres with covariances, and what was turned down and why."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from process.blobs import Blobs, Rejected, Scene, find_blobs, scene_of
+from process.blobs import Blobs, Rejected, Scene, find_blobs, lit_groups, scene_of
 from process.spot_fit import (
     AMPLITUDE,
     BACKGROUND,
@@ -34,7 +34,6 @@ Pixels = NDArray[np.uint8]
 
 _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH = 4, 28  # of the round patches, pixels
 _RIM_PX = 3.0  # a patch reaches this far beyond the blob
-_FITTED_TOGETHER = 10  # images: more share what a call costs, fewer stay in a core's own cache
 _HOT_SIZE_PX = 0.5  # no lens draws a smaller spot
 
 
@@ -103,139 +102,129 @@ def detect(image: Pixels, settings: DetectSettings | None = None) -> Detections:
     return detect_all([image], settings or DetectSettings())[0]
 
 
-def detect_all(images: Sequence[Pixels], settings: DetectSettings) -> list[Detections]:
-    """``detect`` for several images, faster than one by one."""
-    return detections([sight(image, settings) for image in images], settings)
+def detect_all(images: Iterable[Pixels], settings: DetectSettings) -> list[Detections]:
+    """``detect`` for several images, faster than one by one.
+
+    Each is taken when it is its turn to be looked through, and looked at again later.
+    """
+    if settings.method == "paper":
+        return [_detect_paper(image, settings) for image in images]
+    scenes, groups = [], []
+    for image in images:
+        scenes.append(scene_of(image, settings.contrast))
+        groups.append(lit_groups(scenes[-1]))
+    if not scenes:
+        return []
+    blobs, counts = find_blobs(scenes, groups, settings.largest_radius_px, settings.least_roundness)
+    sight = _sight(scenes, blobs, counts, settings)
+    return _judged(sight, _fitted(sight, settings), settings)
 
 
 @dataclass(eq=False)
-class Sight:
-    """One image's candidates, before anything is fitted to them, and all that is needed of the image for that."""
+class _Sight:
+    """The candidates of several images, before anything is fitted to them."""
 
+    scenes: Sequence[Scene]
+    parts: Sequence[slice]
+    """of the N candidates, for each image"""
     blobs: Blobs
     start: Array
     """(N, 8)"""
+    half_widths: NDArray[np.intp]
+    """(N,) of the patches, pixels"""
     patches: Patches
     """round ones about the candidates, without what is nearer to a rejected blob"""
     apart: Array
     """(K,) their usable pixels, without those nearer to another candidate, too"""
-    half_widths: NDArray[np.intp]
-    """(N,) of the patches, pixels"""
-    floor: float
-    """grey levels of background that the blobs' peaks are counted from"""
-    rejected: list[Rejected]
 
-    def __len__(self) -> int:
-        return len(self.blobs)
-
-    def reject(self, candidate: int, reason: str) -> None:
+    def reject(self, scene: Scene, candidate: int, reason: str) -> None:
         """Note that a candidate is turned down."""
-        blobs = self.blobs
-        self.rejected.append(Rejected(float(blobs.u_px[candidate]), float(blobs.v_px[candidate]), reason))
+        scene.reject(self.blobs.u_px[candidate], self.blobs.v_px[candidate], reason)
 
 
-def sight(image: Pixels, settings: DetectSettings) -> Sight | Detections:
-    """What ``detections`` needs of an image, which is not looked at again; without candidates, or by ``paper``, all."""
-    if settings.method == "paper":
-        return _detect_paper(image, settings)
-    scene = scene_of(image, settings.contrast)
-    blobs = find_blobs(scene, settings.largest_radius_px, settings.least_roundness)
-    if not len(blobs):
-        return _nothing(scene.rejected)
+def _sight(scenes: Sequence[Scene], blobs: Blobs, counts: NDArray[np.intp], settings: DetectSettings) -> _Sight:
     half_widths = np.clip(
         np.ceil(np.sqrt(blobs.area_px / np.pi) + _RIM_PX), _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH
     ).astype(np.intp)
-    start = _start(scene, blobs)
-    patches, apart = _patches(scene, start[:, :2], half_widths, settings)
-    return Sight(blobs, start, patches, apart, half_widths, scene.floor, scene.rejected)
-
-
-def detections(sights: Sequence[Sight | Detections], settings: DetectSettings) -> list[Detections]:
-    """The lights of each image; candidates of several images are fitted together."""
-    found = []
-    for begin in range(0, len(sights), _FITTED_TOGETHER):
-        some = sights[begin : begin + _FITTED_TOGETHER]
-        candidates = [one for one in some if isinstance(one, Sight)]
-        fits = iter(_fit_sights(candidates, settings) if candidates else ())
-        found += [_judged(one, next(fits), settings) if isinstance(one, Sight) else one for one in some]
-    return found
-
-
-def _fit_sights(sights: Sequence[Sight], settings: DetectSettings) -> list[Fit]:
-    """What was fitted in each image."""
-    patches = Patches.join([one.patches for one in sights])
-    patches = replace(patches, usable=np.concatenate([one.apart for one in sights]))
-    start = np.concatenate([one.start for one in sights])
-    curve, start[:, EDGE] = start_shape(patches, start, np.concatenate([one.blobs.area_px for one in sights]))
-    start[:, CURVE_UU] = start[:, CURVE_VV] = curve
-    ends = np.cumsum([len(one) for one in sights]).tolist()
-    parts = [slice(begin, end) for begin, end in pairwise([0, *ends])]
-    if settings.method == "fast":
-        centres = windowed_centres(patches, start)
-        fit = Fit(start, centres.covariance_px2, np.ones(len(start)), centres.converged)
-        fit.parameters[:, :2] = centres.centres_px
-    else:
-        fit = fit_spots(patches, start)
-        _fit_neighbours_again(sights, [fit[part] for part in parts])
-    return [fit[part] for part in parts]
-
-
-def _fit_neighbours_again(sights: Sequence[Sight], fits: Sequence[Fit]) -> None:
-    """Fit those once more, in place, that have a neighbour in reach, its light taken out."""
-    members, patches, others, start = [], [], [], []
-    for one, fit in zip(sights, fits, strict=True):
-        near = _chebyshev(fit.parameters[:, :2]) <= one.half_widths[:, None] + _RIM_PX
-        near &= fit.converged[None, :]
-        own = np.flatnonzero(near.any(axis=1) & fit.converged)
-        members.append(own)
-        if own.size:
-            around = one.patches[own]
-            patches.append(around)
-            others.append(_light_of_others(around, fit.parameters, own, near))
-            start.append(fit.parameters[own])
-    if not patches:
-        return
-    again = fit_spots(Patches.join(patches), np.concatenate(start), np.concatenate(others))
-    begin = 0
-    for fit, own in zip(fits, members, strict=True):
-        part = again[begin : begin + own.size]
-        begin += own.size
-        fit.parameters[own], fit.covariance_px2[own] = part.parameters, part.covariance_px2
-        fit.chi2_per_dof[own], fit.converged[own] = part.chi2_per_dof, part.converged
-
-
-def _judged(sight: Sight, fit: Fit, settings: DetectSettings) -> Detections:
-    """The spots that are lights; why the others are not is noted."""
-    keep = _without_bad_fits(sight, fit)
-    keep = _without_reflections(sight, fit, keep, settings)
-    blobs = sight.blobs[keep]
-    saturated = blobs.peak + sight.floor >= settings.saturation
-    parameters = fit.parameters[keep]
-    return Detections(
-        parameters[:, U].copy(),
-        parameters[:, V].copy(),
-        fit.covariance_px2[keep],
-        parameters[:, AMPLITUDE].copy(),
-        blobs.area_px,
-        blobs.circularity,
-        tuple("saturated" if yes else "" for yes in saturated.tolist()),
-        tuple(sight.rejected),
-    )
-
-
-def _nothing(rejected: Sequence[Rejected]) -> Detections:
-    empty = np.empty(0)
-    return Detections(empty, empty, np.empty((0, 2, 2)), empty, empty, empty, (), tuple(rejected))
-
-
-def _start(scene: Scene, blobs: Blobs) -> Array:
-    """(N, 8) places, amplitudes and backgrounds; the shapes need the patches."""
+    parts = [slice(begin, end) for begin, end in pairwise([0, *np.cumsum(counts).tolist()])]
     start = np.zeros((len(blobs), PARAMETERS))
     start[:, U], start[:, V] = blobs.u_px, blobs.v_px
     start[:, AMPLITUDE] = np.maximum(blobs.peak, 1.0)
     rows, columns = np.rint(blobs.v_px).astype(np.intp), np.rint(blobs.u_px).astype(np.intp)
-    start[:, BACKGROUND] = scene.background(rows, columns)
-    return start
+    for scene, part in zip(scenes, parts, strict=True):
+        start[part, BACKGROUND] = scene.background(rows[part], columns[part])
+    patches, apart = _patches(scenes, parts, start[:, :2], half_widths, settings)
+    return _Sight(scenes, parts, blobs, start, half_widths, patches, apart)
+
+
+def _fitted(sight: _Sight, settings: DetectSettings) -> Fit:
+    """What was fitted; the shapes of the start need the patches."""
+    patches, start = replace(sight.patches, usable=sight.apart), sight.start
+    if not len(start):
+        return Fit(start, np.empty((0, 2, 2)), np.empty(0), np.empty(0, dtype=bool))
+    curve, start[:, EDGE] = start_shape(patches, start, sight.blobs.area_px)
+    start[:, CURVE_UU] = start[:, CURVE_VV] = curve
+    if settings.method == "fast":
+        centres = windowed_centres(patches, start)
+        fit = Fit(start, centres.covariance_px2, np.ones(len(start)), centres.converged)
+        fit.parameters[:, :2] = centres.centres_px
+        return fit
+    fit = fit_spots(patches, start)
+    _fit_neighbours_again(sight, fit)
+    return fit
+
+
+def _fit_neighbours_again(sight: _Sight, fit: Fit) -> None:
+    """Fit those once more, in place, that have a neighbour in reach, its light taken out."""
+    reach = sight.half_widths + _RIM_PX
+    members, rivals = [], []
+    for part in sight.parts:
+        near = _chebyshev(fit.parameters[part, :2]) <= reach[part, None]
+        near &= fit.converged[part]
+        for number in np.flatnonzero(near.any(axis=1) & fit.converged[part]).tolist():
+            members.append(part.start + number)
+            rivals.append(part.start + np.flatnonzero(near[number]))
+    if not members:
+        return
+    own = np.array(members)
+    patches = sight.patches[own]
+    others = np.concatenate(
+        [
+            spot_light(
+                fit.parameters[near], patches.u_px[begin : begin + count], patches.v_px[begin : begin + count]
+            ).sum(axis=0)
+            for near, begin, count in zip(rivals, patches.begins.tolist(), patches.counts.tolist(), strict=True)
+        ]
+    )
+    again = fit_spots(patches, fit.parameters[own], others)
+    fit.parameters[own], fit.covariance_px2[own] = again.parameters, again.covariance_px2
+    fit.chi2_per_dof[own], fit.converged[own] = again.chi2_per_dof, again.converged
+
+
+def _judged(sight: _Sight, fit: Fit, settings: DetectSettings) -> list[Detections]:
+    """The spots of each image that are lights; why the others are not is noted."""
+    good = _good_fits(sight, fit)
+    size_px = spot_size_px(fit.parameters)
+    found = []
+    for scene, part in zip(sight.scenes, sight.parts, strict=True):
+        keep = part.start + np.flatnonzero(good[part])
+        double = np.tril(_chebyshev(fit.parameters[keep, :2]) <= 0.7).any(axis=1)  # two parts that became one
+        keep = _without_reflections(sight, scene, fit, size_px, keep[~double], settings)
+        blobs, parameters = sight.blobs[keep], fit.parameters[keep]
+        saturated = blobs.peak + scene.floor >= settings.saturation
+        found.append(
+            Detections(
+                parameters[:, U].copy(),
+                parameters[:, V].copy(),
+                fit.covariance_px2[keep],
+                parameters[:, AMPLITUDE].copy(),
+                blobs.area_px,
+                blobs.circularity,
+                tuple("saturated" if yes else "" for yes in saturated.tolist()),
+                tuple(scene.rejected),
+            )
+        )
+    return found
 
 
 @cache
@@ -247,50 +236,54 @@ def _disc(half_width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _patches(
-    scene: Scene, centres_px: Array, half_widths: NDArray[np.intp], settings: DetectSettings
+    scenes: Sequence[Scene],
+    parts: Sequence[slice],
+    centres_px: Array,
+    half_widths: NDArray[np.intp],
+    settings: DetectSettings,
 ) -> tuple[Patches, Array]:
     """Round patches about centres (N, 2), usable but for what is nearer to a rejected blob; and (K,) to each other."""
+    nothing = np.empty(0, dtype=np.intp)
     discs = [_disc(half_width) for half_width in half_widths.tolist()]
     counts = np.array([len(disc[0]) for disc in discs], dtype=np.intp)
     corner = np.repeat(np.rint(centres_px).astype(np.intp).T, counts, axis=1)
-    columns, rows = (np.concatenate([disc[k] for disc in discs]) + corner[k] for k in (0, 1))
-    height, width = scene.image.shape
-    usable = ((columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)).astype(np.float64)
-    np.clip(columns, 0, width - 1, out=columns)
-    np.clip(rows, 0, height - 1, out=rows)
+    columns, rows = (np.concatenate([nothing, *(disc[k] for disc in discs)]) + corner[k] for k in (0, 1))
+    ends = [0, *np.cumsum(counts).tolist()]
+    values, usable = np.empty(len(rows)), np.ones(len(rows))
+    for scene, part in zip(scenes, parts, strict=True):
+        pixels = slice(ends[part.start], ends[part.stop])
+        inside = [
+            np.clip(own[pixels], 0, size - 1) for own, size in zip((rows, columns), scene.image.shape, strict=True)
+        ]
+        values[pixels] = scene.image[inside[0], inside[1]]
+        usable[pixels] = (inside[0] == rows[pixels]) & (inside[1] == columns[pixels])
+    apart = usable.copy()
     patches = Patches(
         columns.astype(np.float64),
         rows.astype(np.float64),
-        scene.image[rows, columns].astype(np.float64),
+        values,
         usable,
         counts,
-        np.full(len(counts), scene.sigma),
+        np.concatenate(
+            [np.full(part.stop - part.start, scene.sigma) for scene, part in zip(scenes, parts, strict=True)]
+        ),
         settings.shot_gain,
         float(settings.saturation),
     )
-    rejected = np.array([(r.u_px, r.v_px) for r in scene.rejected if np.isfinite(r.u_px)]).reshape(-1, 2)
-    apart = usable.copy()
-    rivals = np.concatenate([rejected, centres_px])
-    gap = np.hypot(*(centres_px[:, None] - rivals).transpose(2, 0, 1))
-    for number, rival in np.argwhere((gap > 0.0) & (gap < 3.0 * half_widths[:, None])).tolist():
-        pixels = slice(patches.begins[number], patches.begins[number] + patches.counts[number])
-        # nearer to the spot than to its rival: on the near side of the line half way between them
-        towards, middle = rivals[rival] - centres_px[number], (rivals[rival] + centres_px[number]) / 2.0
-        along = (patches.u_px[pixels] - middle[0]) * towards[0] + (patches.v_px[pixels] - middle[1]) * towards[1]
-        apart[pixels] *= along <= 0.0
-        if rival < len(rejected):
-            usable[pixels] *= along <= 0.0
+    for scene, part in zip(scenes, parts, strict=True):
+        rejected = np.array([(r.u_px, r.v_px) for r in scene.rejected if np.isfinite(r.u_px)]).reshape(-1, 2)
+        rivals = np.concatenate([rejected, centres_px[part]])
+        gap = np.hypot(*(centres_px[part, None] - rivals).transpose(2, 0, 1))
+        for number, rival in np.argwhere((gap > 0.0) & (gap < 3.0 * half_widths[part, None])).tolist():
+            spot = part.start + number
+            pixels = slice(ends[spot], ends[spot + 1])
+            # nearer to the spot than to its rival: on the near side of the line half way between them
+            towards, middle = rivals[rival] - centres_px[spot], (rivals[rival] + centres_px[spot]) / 2.0
+            along = (patches.u_px[pixels] - middle[0]) * towards[0] + (patches.v_px[pixels] - middle[1]) * towards[1]
+            apart[pixels] *= along <= 0.0
+            if rival < len(rejected):
+                usable[pixels] *= along <= 0.0
     return patches, apart
-
-
-def _light_of_others(patches: Patches, parameters: Array, members: NDArray[np.intp], near: NDArray[np.bool_]) -> Array:
-    light = np.zeros_like(patches.values)
-    begin = 0
-    for place, count in zip(members, patches.counts.tolist(), strict=True):
-        own = slice(begin, begin + count)
-        light[own] = spot_light(parameters[near[place]], patches.u_px[own], patches.v_px[own]).sum(axis=0)
-        begin += count
-    return light
 
 
 def _chebyshev(places: Array) -> Array:
@@ -300,30 +293,32 @@ def _chebyshev(places: Array) -> Array:
     return np.asarray(apart)
 
 
-def _without_bad_fits(sight: Sight, fit: Fit) -> NDArray[np.intp]:
+def _good_fits(sight: _Sight, fit: Fit) -> NDArray[np.bool_]:
+    """(N,) candidates that were fitted well."""
     parameters, blobs = fit.parameters, sight.blobs
     moved = np.hypot(parameters[:, U] - blobs.u_px, parameters[:, V] - blobs.v_px)
     lost = ~(fit.converged & (moved <= 2.0))
     hot = ~lost & (spot_size_px(parameters) < _HOT_SIZE_PX)
-    for k in np.flatnonzero(lost | hot).tolist():
-        sight.reject(k, "no fit" if lost[k] else "hot pixel")
-    keep = np.flatnonzero(~(lost | hot))
-    double = np.tril(_chebyshev(parameters[keep, :2]) <= 0.7).any(axis=1)  # two parts that became one
-    return np.asarray(keep[~double])
+    if (lost | hot).any():
+        for scene, part in zip(sight.scenes, sight.parts, strict=True):
+            for k in (part.start + np.flatnonzero((lost | hot)[part])).tolist():
+                sight.reject(scene, k, "no fit" if lost[k] else "hot pixel")
+    return np.asarray(~(lost | hot))
 
 
-def _without_reflections(sight: Sight, fit: Fit, keep: NDArray[np.intp], settings: DetectSettings) -> NDArray[np.intp]:
+def _without_reflections(
+    sight: _Sight, scene: Scene, fit: Fit, size_px: Array, keep: NDArray[np.intp], settings: DetectSettings
+) -> NDArray[np.intp]:
     """Turn down spots that are much weaker than one close by: the shine of that light on the wing."""
     if keep.size < 2:
         return keep
-    parameters = fit.parameters[keep]
-    size = spot_size_px(parameters)
+    parameters, size = fit.parameters[keep], size_px[keep]
     flux = parameters[:, AMPLITUDE] * size**2
     apart = np.hypot(*(parameters[:, None, :2] - parameters[None, :, :2]).transpose(2, 0, 1))
     close = apart < settings.reflection_reach_px + settings.reflection_reach_radii * (size[:, None] + size[None, :])
     shine = (close & (flux[:, None] < settings.reflection_flux * flux[None, :])).any(axis=1)
     for k in keep[shine].tolist():
-        sight.reject(k, "reflection")
+        sight.reject(scene, k, "reflection")
     return np.asarray(keep[~shine])
 
 

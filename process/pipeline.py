@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from capture.errors import ProcessError
 from process.camera_model import Rig, RigSide
-from process.detect import Detections, DetectSettings, Sight, detections, sight
+from process.detect import Detections, DetectSettings, Pixels, detect_all
 from process.flight_cameras import check_cameras
 from process.fuselage_lights import LIGHTS_SCHEMA, light_spots, lights_table
 from process.marker_rows import SeenSet, marker_rows
@@ -160,11 +160,8 @@ def measure_block(job: BlockJob) -> BlockResult:
     rig, settings = job.how.get()
     problems: list[str] = []
     sets = []
-    for frames in _loaded(job.block.places):
-        problems.extend(frames.problems)
-        # without any frame there is no time either: it is in the problems
-        if any(moment is not None for moment in frames.mid_exposures_ns):
-            sets.append((replace(frames, images=(None, None)), _sighted(frames, rig, settings.detection)))
+    for frame_sets in _loaded(job.block.places):
+        sets += _detected(frame_sets, problems, rig, settings.detection)
     seen, rejected = _seen(job.block.side, sets, rig, settings)
     side = rig.side(job.block.side)
     table = marker_rows(seen, side, rig.markers, settings.matching, settings.triangulation)
@@ -173,8 +170,8 @@ def measure_block(job: BlockJob) -> BlockResult:
     return BlockResult(table, len(job.block.places), tuple(problems), dict(rejected), lights)
 
 
-def _loaded(places: Sequence[SetPlaces]) -> Iterator[FrameSet]:
-    """The frame sets, each valid until the next; their bytes come GROUP_SETS at a time, while the last are worked on.
+def _loaded(places: Sequence[SetPlaces]) -> Iterator[Iterator[FrameSet]]:
+    """The frame sets, GROUP_SETS at a time, valid until the next; the next ones' bytes are on their way meanwhile.
 
     Each is checked only when it is its turn: what has just been read through is still in the processor's cache.
     """
@@ -186,8 +183,7 @@ def _loaded(places: Sequence[SetPlaces]) -> Iterator[FrameSet]:
             waiting.result()
             if number + 1 < len(groups):
                 waiting = ahead.submit(following.load, groups[number + 1])
-            for where in group:
-                yield reader.read(where)
+            yield map(reader.read, group)
 
 
 def _reader(name: str) -> FrameSetReader:
@@ -198,35 +194,49 @@ def _reader(name: str) -> FrameSetReader:
     return reader
 
 
-def _sighted(
-    frames: FrameSet, rig: Rig, settings: DetectSettings
-) -> tuple[Sight | Detections, Sight | Detections] | None:
-    """A set's images at first sight; None if one is missing. Raises ProcessError when they do not fit the rig."""
-    _check_size(frames, rig.side(frames.side))
-    image0, image1 = frames.images
-    if image0 is None or image1 is None:
-        return None
-    return sight(image0, settings), sight(image1, settings)
+def _detected(
+    some: Iterator[FrameSet], problems: list[str], rig: Rig, settings: DetectSettings
+) -> list[tuple[FrameSet, tuple[Detections, Detections] | None]]:
+    """Sets without their images, and what was found in these; None if one is missing.
+
+    Raises ProcessError when they do not fit the rig.
+    """
+    sets = []
+
+    def images() -> Iterator[Pixels]:
+        for frames in some:
+            problems.extend(frames.problems)
+            # without any frame there is no time either: it is in the problems
+            if any(moment is not None for moment in frames.mid_exposures_ns):
+                _check_size(frames, rig.side(frames.side))
+                image0, image1 = frames.images
+                whole = image0 is not None and image1 is not None
+                sets.append((replace(frames, images=(None, None)), whole))
+                if image0 is not None and image1 is not None:
+                    yield from (image0, image1)
+
+    spots = iter(detect_all(images(), settings))
+    return [(frames, (next(spots), next(spots)) if whole else None) for frames, whole in sets]
 
 
 def _seen(
     side_name: str,
-    sets: Sequence[tuple[FrameSet, tuple[Sight | Detections, Sight | Detections] | None]],
+    sets: Sequence[tuple[FrameSet, tuple[Detections, Detections] | None]],
     rig: Rig,
     settings: PipelineSettings,
 ) -> tuple[list[SeenSet], Counter[str]]:
-    """Sets of a side, detected and matched one after the other; and the blobs turned down, by reason."""
+    """Sets of a side, matched one after the other; and the blobs that were turned down, by reason."""
     side = rig.side(side_name)
-    spots = detections([one for _, both in sets if both is not None for one in both], settings.detection)
-    rejected = Counter(one.reason.split(":")[0] for found in spots for one in found.rejected)
-    parted = [light_spots(side, pair) for pair in zip(spots[0::2], spots[1::2], strict=True)]
+    pairs = [pair for _, pair in sets if pair is not None]
+    rejected = Counter(one.reason.split(":")[0] for pair in pairs for spots in pair for one in spots.rejected)
+    parted = [light_spots(side, pair) for pair in pairs]
     others = [own for _, own in parted]
     sighted = iter(sightings(side_name, side, rig.markers, others, settings.matching) if others else ())
     lights = iter(own for own, _ in parted)
     seen = []
     track: Track | None = None
-    for frames, both in sets:
-        if both is None:
+    for frames, found in sets:
+        if found is None:
             seen.append(SeenSet(frames))
             continue
         one = next(sighted)
