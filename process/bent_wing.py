@@ -50,9 +50,13 @@ class BentWing:
         x, y, z = (along / np.sqrt(np.sum(along * along, axis=1))[:, None]).T
         # the chord is what of (−1, 0, 0) is across the span, the normal span × chord
         across = np.sqrt(1.0 - x * x)
-        nothing = np.zeros_like(x)
-        rows = np.array([x, y, z, -across, x * y / across, x * z / across, nothing, -z / across, y / across])
-        return np.repeat(rows.T.reshape(-1, 3, 3), 2, axis=0)
+        rows = np.zeros((len(x), 2, 3, 3))
+        for at, column in (((0, 0), x), ((0, 1), y), ((0, 2), z), ((1, 0), -across)):
+            rows[:, :, *at] = column[:, None]
+        y, z = y / across, z / across
+        for at, column in (((1, 1), x * y), ((1, 2), x * z), ((2, 1), -z), ((2, 2), y)):
+            rows[:, :, *at] = column[:, None]
+        return rows.reshape(-1, 3, 3)
 
     def bend_to(self, places_m: Array, measured_m: Array, seen: NDArray[np.bool_]) -> Array:
         """``places_m`` moved smoothly to ``measured_m`` where ``seen``; a weak pull keeps it from running off."""

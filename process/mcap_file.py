@@ -104,7 +104,7 @@ def index_file(path: Path, topics: Container[str] | None = None) -> FileIndex:
 def stream_messages(
     path: Path, topics: Container[str], problems: list[str]
 ) -> Iterator[tuple[MessageHead, memoryview]]:
-    """Each message of ``path`` on ``topics`` with its data, a chunk in memory at a time.
+    """Each message of ``path`` on ``topics`` with its data, a chunk in memory at a time; no others are read.
 
     What cannot be read is said in ``problems`` and left out; nothing is raised.
     """
@@ -114,10 +114,15 @@ def stream_messages(
             chunks = _chunks_of_summary(path, channels)
             if chunks is None:
                 chunks = _chunks_by_scanning(path, descriptor, channels, problems)
+            elif not any(topic in topics for topic in channels.values()):
+                return
             for at, size in chunks:
                 try:
                     head = _chunk_head(os.pread(descriptor, 256, at), size)
-                    heads = list(_messages_of_chunk(str(path), descriptor, at, size, head, channels))
+                    found = _messages_of_chunk(str(path), descriptor, at, size, head, channels)
+                    heads = [one for one in found if one.topic in topics]
+                    if not heads:
+                        continue
                     chunk = memoryview(bytearray(size))
                     _read_fully(descriptor, chunk, at)
                     records = _records_of_chunk(chunk)
@@ -125,8 +130,7 @@ def stream_messages(
                     problems.append(f"{path}: chunk at byte {at} is not readable ({error})")
                     continue
                 for one in heads:
-                    if one.topic in topics:
-                        yield one, records[one.place.at : one.place.at + one.place.size]
+                    yield one, records[one.place.at : one.place.at + one.place.size]
     except OSError as error:
         problems.append(f"{path}: {error.strerror or error}")
 

@@ -18,6 +18,7 @@ from process.mcap_file import BadChunk, ChunkReader, MessageHead, Place, index_f
 Pixels = NDArray[np.uint8]
 SAMPLE_BYTES = 1e9
 SAMPLE_SETS = 5
+INDEXED_AT_ONCE = 4  # files
 SEARCH_DEPTH = 2  # folders below the one named
 
 
@@ -137,8 +138,9 @@ def open_recording(paths: Sequence[Path | str]) -> Recording:
     fingerprints: dict[str, str] = {}
     owner = {image_topic(s, CAMERAS[c]): places[s, c].images for s, c in places}
     owner |= {frame_topic(s, CAMERAS[c]): places[s, c].frames for s, c in places}
-    for path in files:
-        index = index_file(path, {*owner, LOSS_TOPIC})
+    with ThreadPoolExecutor(INDEXED_AT_ONCE) as pool:  # from the disk it is waiting, mostly
+        indexes = list(pool.map(lambda path: index_file(path, {*owner, LOSS_TOPIC}), files))
+    for path, index in zip(files, indexes, strict=True):
         problems.extend(index.problems)
         fingerprints[str(path)] = index.fingerprint
         losses |= _losses([head for head in index.messages if head.topic == LOSS_TOPIC])
