@@ -1,10 +1,11 @@
-"""Noisy values in time → the drift and the vibration in them, as strong as makes the values likeliest.
+"""Noisy values in time → the drift and the vibration in them, as strong as the values themselves make likely.
 
 Several independent modes at once. A value is x = c + d + v + e: c what all of a mode's values are wrong by, d a drift
 that walks at random from where it was before the first, v a vibration that is new each time, e noise. What is wanted is
 d + v. With nothing of either, it is zero and known to be: that is what a mode without motion comes out as.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,10 @@ from reconstruct.tables import Floats
 WALKS = (0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0, 1e2, 1e3, 1e4)  # variances a second,
 SHAKES = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 1e2, 1e3, 1e4)  # of vibration,
 STARTS = (0.0, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6)  # of the drift before the first value: all in a usual value's variance
-MOST_VALUES = 2000  # that the strengths are chosen by
+NOTHING = 0.5  # probability beforehand that there is none of one of these
+MOST_VALUES = 2000  # that the strengths are judged by
+LIKELIEST = 16  # combinations of strengths that are averaged over
+NEGLIGIBLE = 1e-3  # probability of a combination that is not worth its time
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +31,14 @@ class Strength:
     offset: float  # of what all values are wrong by
 
 
-def likeliest(time_s: Floats, values: Floats, variances: Floats, offset: float, *, moved_before: bool) -> Strength:
-    """The strengths that make values (F, J) likeliest, mode by mode, each out of a few powers of ten.
+def likeliest(
+    time_s: Floats, values: Floats, variances: Floats, offset: float, *, moved_before: bool
+) -> tuple[list[Strength], Floats]:
+    """The K likeliest strengths of each mode, and their probabilities (K, J).
 
     Args:
         time_s: (F,) growing.
-        values: what was measured.
+        values: (F, J) what was measured.
         variances: (F, J) of the noise, about 1; infinite where nothing was measured.
         offset: variance of what all values are wrong by.
         moved_before: whether there may have been drift before the first value.
@@ -40,8 +46,12 @@ def likeliest(time_s: Floats, values: Floats, variances: Floats, offset: float, 
     known = np.flatnonzero(np.isfinite(variances).all(axis=1))
     some = known[:: max(1, -(-known.size // MOST_VALUES))]
     starts = STARTS if moved_before else STARTS[:1]
-    walk, shake, start = (axis.ravel()[:, None] for axis in np.meshgrid(WALKS, SHAKES, starts, indexing="ij"))
+    axes = np.meshgrid(WALKS, SHAKES, starts, indexing="ij")
+    walk, shake, start = (axis.ravel()[:, None] for axis in axes)
     likelihood = np.zeros((len(walk), values.shape[1]))
+    for axis, count in zip(axes, (len(WALKS), len(SHAKES), len(starts)), strict=True):
+        of_some = (1.0 - NOTHING) / max(1, count - 1)
+        likelihood += np.log(np.where(axis.ravel() == 0.0, NOTHING, of_some))[:, None]
     mean = np.zeros_like(likelihood)
     spread = np.zeros_like(likelihood) + start + offset
     before_s = time_s[some[0]]
@@ -54,8 +64,28 @@ def likeliest(time_s: Floats, values: Floats, variances: Floats, offset: float, 
         mean = mean + gain * off
         spread = spread - gain * spread
         before_s = time_s[at]
-    best = likelihood.argmax(axis=0)
-    return Strength(walk[best, 0], shake[best, 0], start[best, 0], offset)
+    best = np.argsort(-likelihood, axis=0)[:LIKELIEST]
+    chosen = np.take_along_axis(likelihood, best, axis=0)
+    weights = np.exp(chosen - chosen[0])
+    strengths = [Strength(walk[row, 0], shake[row, 0], start[row, 0], offset) for row in best]
+    return strengths, weights / weights.sum(axis=0)
+
+
+def averaged(
+    time_s: Floats, values: Floats, variances: Floats, strengths: Sequence[Strength], weights: Floats
+) -> tuple[Floats, Floats]:
+    """Drift and vibration together (F, J), and their variances (F, J): what each of K strengths says, with its weight.
+
+    How far the strengths disagree is in the variance.
+    """
+    mean, square = np.zeros_like(values), np.zeros_like(values)
+    for strength, weight in zip(strengths, weights, strict=True):
+        if weight.max() < NEGLIGIBLE:
+            continue
+        found, spread = smoothed(time_s, values, variances, strength)
+        mean += weight * found
+        square += weight * (spread + found**2)
+    return mean, np.maximum(square - mean**2, 0.0)
 
 
 def smoothed(time_s: Floats, values: Floats, variances: Floats, strength: Strength) -> tuple[Floats, Floats]:

@@ -17,9 +17,9 @@ from process.bulb import all_places
 from process.bundle import cross_matrix
 from process.camera_model import MarkerLayout, RigSide
 from process.fuselage_lights import LightSpots, lights_seen
-from process.pose_fit import CHI2_LIMIT, MEDIAN_CHI2, project
+from process.pose_fit import CHI2_LIMIT, project
 from reconstruct.fit import Fit, marker_places
-from reconstruct.random_walk import likeliest, smoothed
+from reconstruct.random_walk import averaged, likeliest
 from reconstruct.rotation import exponential
 from reconstruct.tables import Bools, Floats, Ints, MarkerSeries, SetMotion
 from reconstruct.wing import HalfWing
@@ -27,7 +27,7 @@ from reconstruct.wing import HalfWing
 FEWEST_LIGHTS = 3  # by both cameras
 FIRST_SETS = 50  # that motion is counted from where the rig does not say what the survey saw
 FLOOR_PX = 0.01  # of a spot's place: what the model of spots leaves
-REJECTIONS = 3  # lights of a set that may be left out
+CULPRIT = 3.0  # times the χ² a degree of freedom of the others, of a light that is to be left out; two at a time: 3.5
 STEPS = 3  # of solving for the pose: turns of some milliradians are not quite linear
 
 
@@ -81,9 +81,9 @@ def root_motion(lights: pa.Table, name: str, side: RigSide) -> RootMotion | None
     times = (sets.timestamp_ns - sets.timestamp_ns[0]) * 1e-9
     values, variances = modes.of(posed)
     base_variance = 1.0 if since == "survey" else 1.0 / min(FIRST_SETS, int(enough.sum()))
-    strength = likeliest(times, values, variances, base_variance, moved_before=since == "survey")
+    strengths, weights = likeliest(times, values, variances, base_variance, moved_before=since == "survey")
     centre = side.T_body_cam0[:3, 3]
-    change, covariance = modes.back(*smoothed(times, values, variances, strength))
+    change, covariance = modes.back(*averaged(times, values, variances, strengths, weights))
     return RootMotion(sets.trigger_index, SetMotion(change, covariance, posed.lights, centre), since)
 
 
@@ -164,43 +164,66 @@ def _median(pixels: Floats) -> Floats:
 
 
 def _poses(side: RigSide, spots: LightSpots, base: Floats) -> _Poses:
-    """Each set's pose by least squares; lights that do not fit the others are left out."""
+    """Each set's pose by least squares; of lights that do not fit the others, the culprit is left out."""
     slope, moved_px = _by_pose(side)
-    change_px = spots.pixels - base
-    good: Bools = np.asarray(np.isfinite(change_px).all(axis=3))
-    spread = np.where(good[..., None, None], spots.covariance_px2, np.eye(2)) + FLOOR_PX**2 * np.eye(2)
-    weight = np.linalg.inv(spread)
+    change_px = (spots.pixels - base).reshape(*spots.pixels.shape[:2], 4)
+    good: Bools = np.asarray(np.isfinite(change_px).all(axis=2))
+    spread = np.zeros((*good.shape, 4, 4))
+    for camera in (0, 1):
+        own = np.s_[2 * camera : 2 * camera + 2]
+        spread[:, :, own, own] = np.where(good[..., None, None], spots.covariance_px2[:, :, camera], np.eye(2))
+    spread += FLOOR_PX**2 * np.eye(4)
     change_px = np.where(good[..., None], change_px, 0.0)
-    scale = 1.0
-    for rejection in range(REJECTIONS + 1):
-        W = weight * good[..., None, None]
-        information = np.einsum("lcpi,flcpq,lcqj->fij", slope, W, slope)
-        enough = good.all(axis=2).sum(axis=1) >= FEWEST_LIGHTS
-        covariance = np.full(information.shape, np.nan)
-        covariance[enough] = np.linalg.inv(information[enough])
+    weight = np.linalg.inv(spread)
+    while True:
+        enough = np.asarray(good.sum(axis=1) >= FEWEST_LIGHTS)
+        W = weight * (good & enough[:, None])[..., None, None]
+        information = np.einsum("lpi,flpq,lqj->fij", slope, W, slope, optimize=True)
+        covariance = np.linalg.inv(np.where(enough[:, None, None], information, np.eye(6)))
         change = np.zeros((len(good), 6))
         for _ in range(STEPS):
             left = change_px - moved_px(change)
-            change = change + np.einsum(
-                "fij,lcpj,flcpq,flcq->fi", np.nan_to_num(covariance), slope, W, left, optimize=True
-            )
+            change = change + np.einsum("fij,lpj,flpq,flq->fi", covariance, slope, W, left, optimize=True)
         left = change_px - moved_px(change)
-        chi2 = np.einsum("flcp,flcpq,flcq->fl", left, W, left)
-        of_all = chi2[enough][good[enough].all(axis=2)]
-        scale = max(1.0, float(np.median(of_all)) / MEDIAN_CHI2) if of_all.size else 1.0
-        if rejection == REJECTIONS:
+        chi2 = np.einsum("flp,flpq,flq->fl", left, W, left, optimize=True)
+        culprit = _culprits(left, spread - slope @ covariance[:, None] @ slope.transpose(0, 2, 1), chi2, good)
+        if not (culprit >= 0).any():
             break
-        worst = chi2.argmax(axis=1)
-        bad = enough & (chi2.max(axis=1) > CHI2_LIMIT * scale)
-        if not bad.any():
-            break
-        good[bad, worst[bad]] = False
-    lights = np.where(enough, good.all(axis=2).sum(axis=1), 0)
+        good[np.flatnonzero(culprit >= 0), culprit[culprit >= 0]] = False
+    lights = np.where(enough, good.sum(axis=1), 0)
+    scale = _scale(left[enough], W[enough], good[enough])
     return _Poses(np.where(enough[:, None], change, np.nan), scale * covariance, lights)
 
 
+def _scale(left: Floats, weight: Floats, good: Bools) -> float:
+    """By how much χ² a degree of freedom exceeds 1, if it does; what is the same in all sets, the base's, left out."""
+    count = np.maximum(good.sum(axis=0), 1)[:, None]
+    left = left - np.where(good[..., None], left, 0.0).sum(axis=0) / count
+    chi2 = np.einsum("flp,flpq,flq->f", left, weight, left, optimize=True)
+    return max(1.0, float(np.median(chi2 / (4.0 * good.sum(axis=1) - 6.0)))) if len(left) else 1.0
+
+
+def _culprits(left: Floats, own_spread: Floats, chi2: Floats, good: Bools) -> Ints:
+    """(F,) the light of each set that does not fit, and far less so than the others; −1 where there is none.
+
+    Leaving a light out lessens χ² by its residual in the covariance that a residual has, measurement less fit. The
+    survey's picture may have as much noise as the set's: χ² of both is allowed.
+    """
+    count, whole = good.sum(axis=1), chi2.sum(axis=1)
+    doubtful = (chi2.max(axis=1) > 2.0 * CHI2_LIMIT) & (count > FEWEST_LIGHTS)
+    found = np.full(len(good), -1)
+    rows = np.flatnonzero(doubtful)
+    if rows.size:
+        less = np.einsum("flp,flpq,flq->fl", left[rows], np.linalg.inv(own_spread[rows]), left[rows])
+        less[~good[rows]] = -np.inf
+        worst = less.argmax(axis=1)
+        of_others = (whole[rows] - less.max(axis=1)) / (4.0 * count[rows] - 10.0)
+        found[rows] = np.where(less.max(axis=1) / 4.0 > CULPRIT * of_others, worst, -1)
+    return found
+
+
 def _by_pose(side: RigSide) -> tuple[Floats, Callable[[Floats], Floats]]:
-    """Pixels by the pair's motion: (L, 2, 2, 6) at rest, and the function of motions (F, 6) to changes (F, L, 2, 2)."""
+    """Pixels u0, v0, u1, v1 by the pair's motion: (L, 4, 6) at rest; and what (F, 6) changes them by, (F, L, 4)."""
     places = np.array([light.xyz_m for light in side.references])
     T = side.T_body_cam0
     T10 = side.pair.T_cam1_cam0
@@ -208,13 +231,13 @@ def _by_pose(side: RigSide) -> tuple[Floats, Callable[[Floats], Floats]]:
     by_cam0 = side.pair.cam0.project_with_jacobian(in_cam0)[1]
     by_cam1 = side.pair.cam1.project_with_jacobian(in_cam0 @ T10[:3, :3].T + T10[:3, 3])[1] @ T10[:3, :3]
     by_point = np.stack([by_cam0, by_cam1], axis=1) @ T[:3, :3].T
-    slope = np.concatenate([by_point @ cross_matrix(places - T[:3, 3])[:, None], -by_point], axis=3)
+    slope = np.concatenate([by_point @ cross_matrix(places - T[:3, 3])[:, None], -by_point], axis=3).reshape(-1, 4, 6)
     at_rest = _pixels(side, places)
 
     def change(motion: Floats) -> Floats:
         turn, shift = motion[:, None, :3], motion[:, None, 3:]
         seen = (exponential(-turn) @ (places - T[:3, 3] - shift)[..., None])[..., 0] + T[:3, 3]
-        return np.asarray(_pixels(side, seen) - at_rest)
+        return (_pixels(side, seen) - at_rest).reshape(*seen.shape[:2], 4)
 
     return slope, change
 
