@@ -113,7 +113,8 @@ def sigma_by_motion(half: HalfWing, fits: Fit, motion: SetMotion) -> Floats:
     places = marker_places(half, fits) - motion.centre_m
     by_motion = np.concatenate([-cross_matrix(places), np.broadcast_to(np.eye(3), (*places.shape, 3))], axis=3)
     response = fits.moved_by(by_motion)
-    return np.asarray(np.sqrt(np.sum((response @ motion.covariance[:, None]) * response, axis=3)))
+    variance = np.sum((response @ motion.covariance[:, None]) * response, axis=3)
+    return np.asarray(np.sqrt(np.where(variance < 0.0, 0.0, variance)))  # rounding; NaN, of no fit, stays
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,8 @@ from mounted_pair import mounted
 from process.camera_model import MarkerLayout, ReferenceLight
 from process.fuselage_lights import LightSpots, lights_table
 from process.triangulate import triangulate
-from reconstruct.fit import fit_frame
+from reconstruct.fit import fit_each, marker_problem
+from reconstruct.prior import STATED
 from reconstruct.random_walk import Strength, likeliest, smoothed
 from reconstruct.root_motion import RootMotion, root_motion, sigma_by_motion, with_motion
 from reconstruct.tables import Centroids, MarkerSeries, SetMotion
@@ -195,18 +196,16 @@ def test_a_set_without_frames_of_both_cameras_has_its_neighbours_motion():
 def test_the_shape_follows_a_motion_that_was_not_known_as_its_sigma_says(xhale, closed_form):
     half = xhale.half("right")
     truth = closed_form(half, 0.2, 1.0, 0.0)
-    cov = np.broadcast_to(0.5e-3**2 * np.eye(3), (18, 3, 3))
-    fit = fit_frame(half, truth.markers_m, cov, xhale.fit)
+    changes = np.concatenate([np.zeros((1, 6)), 1e-4 * np.eye(6)])
     centre = np.array([-0.1, -0.2, 0.08])
-    for column in range(6):
-        change = np.zeros(6)
-        change[column] = 1e-4
-        turned = np.cross(change[:3], truth.markers_m - centre) + change[3:]
-        other = fit_frame(half, truth.markers_m + turned, cov, xhale.fit, fit)
-        motion = SetMotion(np.zeros((1, 6)), np.outer(change, change)[None], np.array([6]), centre)
-        sigma = sigma_by_motion(half, fit, motion, 0)
-        np.testing.assert_allclose(sigma[:, :3], np.abs(other.position_m - fit.position_m), atol=3e-6)
-        np.testing.assert_allclose(sigma[:, 3], np.abs(other.twist_rad - fit.twist_rad), atol=3e-6)
+    turned = np.cross(changes[:, None, :3], truth.markers_m - centre) + changes[:, None, 3:]
+    cov = np.broadcast_to(0.5e-3**2 * np.eye(3), (7, 18, 3, 3))
+    fits = fit_each(marker_problem(half, truth.markers_m + turned, cov, xhale.fit), xhale.fit, STATED)
+    motion = SetMotion(np.zeros((7, 6)), changes[:, :, None] * changes[:, None], np.full(7, 6), centre)
+    sigma = sigma_by_motion(half, fits, motion)
+    assert sigma[1:, -1, :3].max() > 1e-4
+    np.testing.assert_allclose(sigma[..., :3], np.abs(fits.position_m - fits.position_m[0]), atol=3e-6)
+    np.testing.assert_allclose(sigma[..., 3], np.abs(fits.twist_rad - fits.twist_rad[0]), atol=3e-6)
 
 
 @pytest.mark.parametrize("shake", [0.0, 2.0])

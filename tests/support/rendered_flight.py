@@ -18,10 +18,11 @@ from capture.recorder import camera_channels
 from capture.ring import Ring
 from capture.segment import FrameLayout, SegmentWriter
 from capture.trigger_protocol import Pulse
+from hw_sim import optics
 from hw_sim.render import LiveRenderer, Pixels, noise_frames
 from hw_sim.truth import AROUND_NS, write_truth
 from hw_sim.world import World
-from process.camera_model import CameraModel, MarkerLayout, Rig, RigSide, StereoPair
+from process.camera_model import CameraModel, MarkerLayout, ReferenceLight, Rig, RigSide, StereoPair
 
 SEGMENT_S = 10
 CAMERAS = ("cam0", "cam1")
@@ -64,7 +65,13 @@ def true_side(world: World, side: str) -> RigSide:
         for one in (cam0, cam1)
     ]
     pair = StereoPair(models[0], models[1], np.linalg.inv(poses[1]) @ poses[0])
-    return RigSide(pair, poses[0], cam0.serial, cam1.serial, cam0.row_time_us * 1e3)
+    places = world.fuselage_lights_m(side)
+    pixels = np.stack([optics.project(camera, places) for camera in (cam0, cam1)], axis=1)
+    lights = tuple(
+        ReferenceLight(f"F{number}", tuple(place), world.survey.sigma_m, tuple(map(tuple, seen)))
+        for number, (place, seen) in enumerate(zip(places.tolist(), pixels.tolist(), strict=True))
+    )
+    return RigSide(pair, poses[0], cam0.serial, cam1.serial, cam0.row_time_us * 1e3, references=lights)
 
 
 def _triggers(world: World, seconds: float) -> int:
