@@ -14,8 +14,10 @@ from process.json_file import finite_or_none
 from process.reference import Window
 from reconstruct.tables import (
     FRAMES,
+    MARKER_COLUMNS,
     MARKERS,
     SHAPE,
+    SHAPE_COLUMNS,
     Bools,
     Floats,
     Ints,
@@ -76,13 +78,13 @@ def compare(result: Path, reference: Path, *, from_start: bool = False, window: 
     """
     _check_folders(result, reference)
     shape_file, marker_file = str(reference / SHAPE), str(reference / MARKERS)
-    shapes = shape_series(read_table(result / SHAPE, ()), str(result / SHAPE))
-    true_shapes = shape_series(read_table(reference / SHAPE, ()), shape_file, reference=True)
+    shapes = shape_series(read_table(result / SHAPE, (), SHAPE_COLUMNS), str(result / SHAPE))
+    true_shapes = shape_series(read_table(reference / SHAPE, (), SHAPE_COLUMNS), shape_file, reference=True)
     start_ns = min(int(one.timestamp_ns[0]) for one in shapes.values())
     later_ns = start_ns - min(int(one.timestamp_ns[0]) for one in true_shapes.values()) if from_start else 0
     true_shapes = {side: replace(one, timestamp_ns=one.timestamp_ns + later_ns) for side, one in true_shapes.items()}
     shape = [_shape_errors(shapes[side], true_shapes[side], shape_file) for side in shapes if side in true_shapes]
-    markers = marker_series(read_table(result / MARKERS, ()), str(result / MARKERS))
+    markers = marker_series(read_table(result / MARKERS, (), MARKER_COLUMNS), str(result / MARKERS))
     tracks = _tracks(reference / MARKERS, later_ns)
     marker = [_marker_errors(markers[side], tracks.get(side, {}), marker_file) for side in markers]
     if not any(np.isfinite(errors.xyz_m).any() for errors in shape):
@@ -115,7 +117,7 @@ def _check_folders(result: Path, reference: Path) -> None:
 def _tracks(path: Path, later_ns: int) -> dict[str, dict[int, tuple[Ints, Floats]]]:
     if not path.is_file():
         return {}  # a simulation's shapes alone
-    found = marker_tracks(read_table(path, ()), str(path))
+    found = marker_tracks(read_table(path, (), MARKER_COLUMNS), str(path))
     return {
         side: {marker: (times_ns + later_ns, xyz_m) for marker, (times_ns, xyz_m) in tracks.items()}
         for side, tracks in found.items()

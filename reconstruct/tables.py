@@ -43,6 +43,16 @@ LOAD_COLUMNS = ("fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
 ROOT_COLUMNS = ("root_turn_x_rad", "root_turn_y_rad", "root_turn_z_rad", "root_dx_m", "root_dy_m", "root_dz_m")
 NET_COLUMNS = tuple(f"net_{name}" for name in LOAD_COLUMNS)
 TIME_COLUMNS = ("time_sigma_ns", "ptp_state")
+SHAPE_COLUMNS = (
+    *("trigger_index", "side", "timestamp_ns", "station", "s_m", *POSITION, "twist_deg"),
+    *(*SIGMA, "sigma_twist_deg", "flags"),
+)
+"""all that ``shape_series`` looks at"""
+MARKER_COLUMNS = (
+    *("trigger_index", "side", "marker", "timestamp_ns", "frame_timestamp_ns", *POSITION),
+    *(*COVARIANCE, "flags", *TIME_COLUMNS),
+)
+"""all that ``marker_series`` and ``marker_tracks`` look at"""
 _PER_SET = (  # of MarkerSeries
     *("trigger_index", "frame_timestamp_ns", "timestamp_ns", "xyz_m", "cov_m2", "flags"),
     *TIME_COLUMNS,
@@ -153,15 +163,19 @@ class ShapeSeries:
     flags: Words  # (F,) str, empty when good
 
 
-def read_table(path: Path, required: Sequence[str]) -> pa.Table:
+def read_table(path: Path, required: Sequence[str], columns: Sequence[str] | None = None) -> pa.Table:
     """The table at ``path``, checked to be Parquet, to have rows and the ``required`` columns.
+
+    With ``columns``, of these only, as far as it has them: a long flight's tables are large.
 
     Raises UsageError when it is missing, unreadable, empty or lacks a column.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such table")
     try:
-        table = pyarrow.parquet.read_table(path, memory_map=False)
+        if columns is not None:
+            columns = [name for name in columns if name in pyarrow.parquet.read_schema(path).names]
+        table = pyarrow.parquet.read_table(path, memory_map=False, columns=columns)
     except (pa.ArrowException, OSError) as error:
         raise UsageError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]})") from error
     check_columns(table, required, str(path))
