@@ -97,14 +97,19 @@ def fit_each(posed: Unscaled, settings: FitSettings, prior_scale: Array | None =
         start: fits that they begin from, one each or one for all; those that did not converge are ignored, and who
             does not settle from one begins again from the unloaded wing.
     """
-    scale = scale_of(posed, settings, start) if prior_scale is None else prior_scale
+    if prior_scale is None and settings.prior_weight != "data":
+        prior_scale = scale_of(posed, settings)
+    elif prior_scale is None:
+        prior_scale, fitted = _chosen(posed, settings, start)
+        if len(fitted) == len(posed):
+            return fitted
     together = SETS_AT_ONCE if settings.loads == "everywhere" else 1
     fits: list[Fit] = []
     for first in range(0, len(posed), together):
         some = slice(first, first + together)
         before = fits[-1] if fits and together == 1 and start is None else start
         given = before if before is None or np.ndim(before.converged) == 0 or len(before) == 1 else before[some]
-        fits.append(_fit_together(posed[some], settings, scale, given))
+        fits.append(_fit_together(posed[some], settings, prior_scale, given))
     return fits[0] if len(fits) == 1 else Fit.join(fits)
 
 
@@ -160,29 +165,36 @@ def common_scale(half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, sett
     return scale_of(marker_problem(half, marker_xyz_m, marker_cov_m2, settings), settings)
 
 
-def scale_of(posed: Unscaled, settings: FitSettings, start: Fit | None = None) -> Array:
+def scale_of(posed: Unscaled, settings: FitSettings) -> Array:
     """The prior's scale (4,) that many instants together make likeliest (eq. 25), if the data are to choose it.
 
     At most sixty are used, spread evenly. All instants share it: what one set's markers tell of how much the wing
     twists at all is little.
     """
-    scale, weight = STATED, settings.prior_weight
-    if weight != "data":
-        return rescaled(scale, posed.group, np.zeros(1), np.zeros(1), weight)
+    if settings.prior_weight != "data":
+        return rescaled(STATED, posed.group, np.zeros(1), np.zeros(1), settings.prior_weight)
+    return _chosen(posed, settings, None)[0]
+
+
+def _chosen(posed: Unscaled, settings: FitSettings, start: Fit | None) -> tuple[Array, Fit]:
+    """``scale_of`` where the data choose it, and the fits of the instants that it was chosen from."""
     enough = np.flatnonzero(posed.problem.seen.sum(axis=1) >= FEWEST_MARKERS)
     if not enough.size:
-        return scale
+        return STATED, fit_each(posed, settings, STATED, start)
     some = posed[enough[np.unique(np.linspace(0, enough.size - 1, _SCALE_SETS).round().astype(int))]]
-    for _ in range(_SCALE_ROUNDS):
+    scale = STATED if start is None or not np.all(start.converged) else start.prior_scale
+    iterations = np.zeros(len(some), dtype=int)
+    for left in reversed(range(_SCALE_ROUNDS)):
         fits = fit_each(some, settings, scale, start)
+        iterations += fits.iterations
         good = fits.converged
-        if not good.any():
+        if not left or not good.any():
             break
-        start, before = fits, scale
-        scale = rescaled(scale, posed.group, fits.unknowns[good], fits.told[good], weight)
-        if np.abs(np.log(scale / before)).max() < _SAME_SCALE:
+        better = rescaled(scale, posed.group, fits.unknowns[good], fits.told[good], "data")
+        if np.abs(np.log(better / scale)).max() < _SAME_SCALE:
             break
-    return scale
+        start, scale = fits, better
+    return scale, replace(fits, iterations=iterations)
 
 
 def marker_places(half: HalfWing, fit: Fit) -> Array:
@@ -239,20 +251,19 @@ def scaled(posed: Unscaled, scale: Array) -> Problem:
 def _fit_together(posed: Unscaled, settings: FitSettings, scale: Array, start: Fit | None) -> Fit:
     problem, stations = scaled(posed, scale), np.array(settings.load_stations_m)
     count, markers = problem.seen.sum(axis=1), problem.seen.shape[1]
-    reasons = np.array([f"{n} of {markers} markers measured, {FEWEST_MARKERS} needed" for n in count], dtype=object)
     enough = np.flatnonzero(count >= FEWEST_MARKERS)
-    nothing = nothing_of(problem.half, problem.unknowns, stations, scale, reasons)
-    if not enough.size:
-        return nothing
     ends = _ends(posed[enough], problem[enough], settings, *_begin(problem, scale, posed.group, start, enough))
     against = objections(problem[enough], ends)
-    reasons[enough], nothing.iterations[enough] = against, ends.iterations
     good = np.flatnonzero(against == "")
-    if not good.size:
-        return nothing
     rows = enough[good]
-    fitted = fit_of(problem[rows], state_of(problem[rows], ends[good]), stations, scale)
-    return fitted if rows.size == len(posed) else with_rows(nothing, rows, fitted)
+    fitted = fit_of(problem[rows], state_of(problem[rows], ends[good]), stations, scale) if rows.size else None
+    if fitted is not None and rows.size == len(posed):
+        return fitted
+    reasons = np.array([f"{n} of {markers} markers measured, {FEWEST_MARKERS} needed" for n in count], dtype=object)
+    reasons[enough] = against
+    nothing = nothing_of(problem.half, problem.unknowns, stations, scale, reasons)
+    nothing.iterations[enough] = ends.iterations
+    return nothing if fitted is None else with_rows(nothing, rows, fitted)
 
 
 def _begin(problem: Problem, scale: Array, group: Index, start: Fit | None, rows: Index) -> tuple[Array, Array]:
