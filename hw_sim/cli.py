@@ -37,6 +37,9 @@ def world(
     background: Annotated[str, typer.Option(help="dark or sunlit.")] = "dark",
     finish: Annotated[str, typer.Option(help="Of the wing: matt or clean.")] = "matt",
     leds: Annotated[str, typer.Option(help="On the wing: disc, or dome (bulbs that stand off the wing).")] = "disc",
+    placement_mm: Annotated[
+        float, typer.Option(min=0.0, help="One sigma by which they are off their places on the wing, each axis.")
+    ] = 0.2,
     fuselage_lights: Annotated[
         bool, typer.Option("--fuselage-lights", help="Six reference lights a side, on in the survey and in flight.")
     ] = False,
@@ -54,6 +57,7 @@ def world(
         background,
         finish,
         form=leds,
+        placement_sigma_m=placement_mm / 1000.0,
         fuselage=FUSELAGE_LIGHTS if fuselage_lights else None,
         mount_motion=MountMotion(
             drift_mm=mount_drift[0],

@@ -104,19 +104,20 @@ class LedMotion:
         pairs = len(leds.pairs_station_m)
         self._wing = WingMotion(world, side, np.repeat(leds.pairs_station_m, len(leds.chord_m)))
         forward = 1.0 if side == "right" else -1.0
-        self._e2_m = forward * np.tile(leds.chord_m, pairs)
-        self._height_m = leds.height_m
+        across = forward * np.tile(leds.chord_m, pairs)
+        drawn = np.stack([np.zeros(len(across)), across, np.full(len(across), leds.height_m)], axis=1)
+        rng = np.random.default_rng([world.seed, 0x91ACE, *side.encode()])
+        self._offset_m = drawn + leds.placement_sigma_m * rng.standard_normal(drawn.shape)
         elevation = math.radians(leds.elevation_deg)
         self._beam = np.array([-math.cos(elevation), 0.0, math.sin(elevation)])
 
     def __len__(self) -> int:
-        return len(self._e2_m)
+        return len(self._offset_m)
 
     def centres(self, times_ns: Times) -> tuple[Array, Array]:
         """Light centres (..., n, 3) in the body frame, and section frames (..., n, 3, 3); ``times_ns`` (..., n)."""
         state = self._wing.state(times_ns)
-        e2, e3 = state.frames[..., :, 1], state.frames[..., :, 2]
-        return state.points_m + self._e2_m[:, None] * e2 + self._height_m * e3, state.frames
+        return state.points_m + (state.frames @ self._offset_m[:, :, None])[..., 0], state.frames
 
     def beams(self, frames: Array) -> Array:
         """The beams' axes (..., n, 3), unit vectors in the body frame, of section frames (..., n, 3, 3)."""

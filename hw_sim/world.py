@@ -40,6 +40,7 @@ class Leds:
     pairs_station_m: tuple[float, ...] = (0.2, 0.5, 0.8, 1.2, 1.5, 1.8, 2.2, 2.5, 2.8)
     chord_m: tuple[float, ...] = (0.04, -0.10)  # forward of the axis
     height_m: float = 0.004  # of the light's centre above the axis plane
+    placement_sigma_m: float = 0.0  # by which a light is off its place, along each axis of its section
     diameter_m: float = 0.003
     form: str = "disc"  # disc: flat, it faces every camera | dome: a bulb, half a ball of this diameter on the wing
     elevation_deg: float = 10.0  # of the beam's axis above the section plane; it points inboard
@@ -247,6 +248,7 @@ class World:
         finish: str = "matt",
         *,
         form: str = "disc",
+        placement_sigma_m: float = 0.0,
         fuselage: Fuselage | None = None,
         mount_motion: MountMotion | None = None,
     ) -> Self:
@@ -258,6 +260,7 @@ class World:
             background: ``dark`` or ``sunlit``.
             finish: of the wing, ``matt`` or ``clean``.
             form: of the wing's lights, ``disc`` or ``dome``.
+            placement_sigma_m: by which they are off their places, each axis.
             fuselage: reference lights; None for none.
             mount_motion: of the camera pairs; None for none.
 
@@ -273,7 +276,7 @@ class World:
             epoch_ns=1_700_000_000_000_000_000,
             trigger_rate_hz=25.0,
             wing=Wing(),
-            leds=Leds(diameter_m=diameter_m * (1 + 0.75 * (scale - 1)), form=form),
+            leds=Leds(diameter_m=diameter_m * (1 + 0.75 * (scale - 1)), form=form, placement_sigma_m=placement_sigma_m),
             sensor=sensor,
             scene=Scene(background=background, finish=finish),
             mount=Mount(),

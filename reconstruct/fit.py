@@ -146,8 +146,13 @@ def fit_from(
     )
 
 
-def marker_problem(half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, settings: FitSettings) -> Unscaled:
-    """The problem of markers at known places (…, M, 3), with covariances (…, M, 3, 3); NaN where not measured."""
+def marker_problem(
+    half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, settings: FitSettings, shared: Array | None = None
+) -> Unscaled:
+    """The problem of markers at known places (…, M, 3), with covariances (…, M, 3, 3); NaN where not measured.
+
+    ``shared`` (…, M, 3, P) is how errors that all of them share move them (eq. 32); loads must then act everywhere.
+    """
     markers = len(half.marker_ids)
     if marker_xyz_m.shape[-2:] != (markers, 3) or marker_cov_m2.shape[-3:] != (markers, 3, 3):
         raise ValueError(f"expected {markers} markers, got shapes {marker_xyz_m.shape} and {marker_cov_m2.shape}")
@@ -157,7 +162,7 @@ def marker_problem(half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, se
     full = np.where(seen[..., None, None], safe, np.eye(3)) + settings.marker_model_sigma_m**2 * np.eye(3)
     whiten = np.linalg.inv(np.linalg.cholesky(full)) * seen[..., None, None]
     xyz = np.where(seen[..., None], marker_xyz_m, 0.0)
-    return pose(half, settings, Places(xyz, whiten), seen, 3.0 * seen.astype(np.float64))
+    return pose(half, settings, Places(xyz, whiten), seen, 3.0 * seen.astype(np.float64), shared)
 
 
 def common_scale(half: HalfWing, marker_xyz_m: Array, marker_cov_m2: Array, settings: FitSettings) -> Array:
@@ -205,7 +210,14 @@ def marker_places(half: HalfWing, fit: Fit) -> Array:
     return places
 
 
-def pose(half: HalfWing, settings: FitSettings, measure: Measure, seen: Mask, coordinates: Array) -> Unscaled:
+def pose(
+    half: HalfWing,
+    settings: FitSettings,
+    measure: Measure,
+    seen: Mask,
+    coordinates: Array,
+    shared: Array | None = None,
+) -> Unscaled:
     """The problem of finding the half wing that ``measure`` was taken of (eq. 16), at one instant or F.
 
     Args:
@@ -214,10 +226,13 @@ def pose(half: HalfWing, settings: FitSettings, measure: Measure, seen: Mask, co
         measure: how far any markers are from those measured.
         seen: (…, M) which were.
         coordinates: (…, M) numbers measured of each.
+        shared: (…, M, 3, P) how unit errors that all markers share move them.
     """
     stations = settings.load_stations_m
     sigma = np.tile(np.repeat([settings.force_sigma_n, settings.moment_sigma_nm], 3), len(stations))
     group = _group(half, settings)
+    if shared is not None:
+        group = np.concatenate([group, np.full(shared.shape[-1], FREE)])
     prior = np.ones(len(group))
     modes = None
     if settings.loads == "everywhere":
@@ -235,6 +250,7 @@ def pose(half: HalfWing, settings: FitSettings, measure: Measure, seen: Mask, co
         seen=seen,
         coordinates=coordinates,
         outlier_sigma=settings.outlier_sigma,
+        shared=shared,
     )
     return Unscaled(problem, group)
 
@@ -244,7 +260,7 @@ def scaled(posed: Unscaled, scale: Array) -> Problem:
     root = np.sqrt(scale[posed.group])
     problem = posed.problem
     if problem.modes is not None:
-        return replace(problem, modes=problem.modes * root)
+        return replace(problem, modes=problem.modes * root[: problem.modes.shape[1]])
     return replace(problem, load_scale=root[: len(problem.load_sigma)])
 
 

@@ -52,16 +52,19 @@ class Problem:
     seen: Mask  # (…, M) bool
     coordinates: Array  # (…, M) numbers measured of each marker
     outlier_sigma: float
+    shared: Array | None = None  # (…, M, 3, P) how unit errors that all markers share move them; P unknowns more
 
     @property
     def unknowns(self) -> int:
-        """u: the modes, or the loads at the stations and the stiffness's four logarithms."""
+        """u: the modes and the shared errors, or the loads at the stations and the stiffness's four logarithms."""
         return len(self.prior)
 
     def __getitem__(self, rows: Index | slice) -> "Problem":
         """Some of the F instants."""
         rows = np.arange(len(self.seen))[rows]
-        return replace(self, measure=self.measure[rows], seen=self.seen[rows], coordinates=self.coordinates[rows])
+        shared = None if self.shared is None else self.shared[rows]
+        seen, coordinates = self.seen[rows], self.coordinates[rows]
+        return replace(self, measure=self.measure[rows], seen=seen, coordinates=coordinates, shared=shared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,6 +238,11 @@ def linearise(problem: Problem, strain: Array, theta: Array) -> Linear:
     nodes, which = half.marked_nodes
     by_motion = np.concatenate([-by_point @ hat(point), by_point], axis=-1)
     motion = by_motion @ node_motion(shape, both, nodes)[..., which, :, :]
+    if problem.shared is not None:
+        by_shared = by_point @ problem.shared
+        residual = residual + (by_shared @ theta[..., None, both.shape[-1] :, None])[..., 0]
+        motion = np.concatenate([motion, by_shared], axis=-1)
+        both = np.pad(both, ((0, 0), (0, by_shared.shape[-1])))
     corrects = problem.modes is None  # loads everywhere are in equilibrium with any strains
     return Linear(
         shape=shape,

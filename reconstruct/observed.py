@@ -12,6 +12,7 @@ from reconstruct.fit import Unscaled, marker_problem
 from reconstruct.instants import InstantSettings, at_common_instant, pixels_at_common_instant
 from reconstruct.iteration import FEWEST_MARKERS
 from reconstruct.pixels import pixel_problem, px_per_m
+from reconstruct.shared import SharedError
 from reconstruct.tables import Bools, Floats, Ints, MarkerSeries, centroid_series
 from reconstruct.wing import HalfWing
 from reconstruct.wing_file import FitSettings
@@ -41,10 +42,17 @@ class Observed:
         known = [member.name for member in fields(cls) if getattr(parts[0], member.name) is not None]
         return cls(**{name: np.concatenate([getattr(one, name) for one in parts]) for name in known})
 
-    def problem(self, half: HalfWing, settings: FitSettings, rig: RigSide | None) -> Unscaled:
-        """What the fit of each set is to explain; ``rig`` is needed for pixels."""
+    def problem(
+        self, half: HalfWing, settings: FitSettings, rig: RigSide | None, shared: SharedError | None = None
+    ) -> Unscaled:
+        """What the fit of each set is to explain; ``rig`` is needed for pixels.
+
+        Places are weighed with the errors that they share, where loads act everywhere.
+        """
         if rig is None or self.pixels is None or self.covariance_px2 is None or self.epipolar_px is None:
-            return marker_problem(half, self.xyz_m, self.cov_m2, settings)
+            weighed = shared is not None and settings.loads == "everywhere"
+            moved = shared.of_markers(half, self.xyz_m) if shared is not None and weighed else None
+            return marker_problem(half, self.xyz_m, self.cov_m2, settings, moved)
         return pixel_problem(half, rig, self.pixels, self.covariance_px2, settings, self.epipolar_px)
 
 

@@ -55,10 +55,7 @@ class Fit:
 
     def moved_by(self, markers: Array) -> Array:
         """(N + 1, 4, P) how nodes (m) and twist (rad) follow, when markers are measured elsewhere by (M, 3, P)."""
-        flat = markers.reshape(*markers.shape[:-3], -1, markers.shape[-1])
-        told = self.told_by.reshape(*self.told_by.shape[:-2], -1) @ flat
-        by_told = self.by_told.reshape(*told.shape[:-2], -1, told.shape[-2])
-        return np.asarray((by_told @ told).reshape(*self.by_told.shape[:-1], -1))
+        return _moved_by(self.by_told, self.told_by, markers)
 
     def __len__(self) -> int:
         """F."""
@@ -126,7 +123,12 @@ def fit_of(problem: Problem, state: State, stations_m: Array, prior_scale: Array
     wider = np.sqrt(np.where(misfit > 1 + _SURELY * np.sqrt(2 / dof), misfit, 1.0))[:, None, None]
     strain_by_told = linear.response @ state.factor.transpose(0, 2, 1)
     by_told = by_strains(half, shape, strain_by_told)
-    sigma = wider * np.sqrt(np.sum(by_told**2, axis=3))
+    told_by = _told_by(state)
+    variance = np.sum(by_told**2, axis=3)
+    if problem.shared is not None:  # what all instants share is not new in each
+        following = _moved_by(by_told, told_by, problem.shared)
+        variance = np.maximum(variance - np.sum(following**2, axis=3), 0.0)
+    sigma = wider * np.sqrt(variance)
     loads, load_covariance = _station_loads(problem, state, wider * state.factor, wider * strain_by_told)
     at_stations = problem.modes is None
     stiffer, softness = np.zeros((len(used), 4)), np.ones((len(used), 4))
@@ -154,7 +156,7 @@ def fit_of(problem: Problem, state: State, stations_m: Array, prior_scale: Array
         sigma_position_m=sigma[:, :, :3],
         sigma_twist_rad=sigma[:, :, 3],
         by_told=by_told,
-        told_by=_told_by(state),
+        told_by=told_by,
         residual_m=np.full((*used.shape, 3), np.nan),
         distance=np.where(problem.seen, linear.distance, np.nan),
         outlier=problem.seen & ~used,
@@ -224,6 +226,12 @@ def with_rows(fit: Fit, rows: Index | Mask, better: Fit) -> Fit:
 
 def _weighted(values: Array, weight: Array) -> Array:
     return np.asarray(np.sqrt(weight)[:, :, None, None] * values)
+
+
+def _moved_by(by_told: Array, told_by: Array, markers: Array) -> Array:
+    told = told_by.reshape(*told_by.shape[:-2], -1) @ markers.reshape(*markers.shape[:-3], -1, markers.shape[-1])
+    flat = by_told.reshape(*told.shape[:-2], -1, told.shape[-2])
+    return np.asarray((flat @ told).reshape(*by_told.shape[:-1], -1))
 
 
 def _told_by(state: State) -> Array:

@@ -13,7 +13,7 @@ from process.camera_model import RigSide
 from process.pipeline import BLOCK_TRIGGERS
 from process.reference import Window
 from process.workers import Shared, crew, usable_cores
-from reconstruct.fit import Fit, fit_each, scale_of, with_residuals
+from reconstruct.fit import Fit, Unscaled, fit_each, scale_of, with_residuals
 from reconstruct.instants import InstantSettings
 from reconstruct.observed import Observed, enough_markers, measured_markers, observe
 from reconstruct.reference import Reference, ReferenceShape, mean_of, recorded, unloaded
@@ -114,6 +114,10 @@ class FitHow:
     """what displacements are counted from; None: the unloaded wing"""
     rig: RigSide | None = None
     """cameras whose pixels are fitted; None: markers' places are"""
+
+    def problem(self, observed: Observed) -> Unscaled:
+        """What the sets' fits are to explain. Smoothing in time takes all errors for new in every set."""
+        return observed.problem(self.half, self.settings, self.rig, self.shared if self.smooth_s == 0 else None)
 
     @property
     def around_s(self) -> float:
@@ -277,7 +281,7 @@ def reference_shape(how: FitHow, side: str, reference: Reference, in_window: Seq
 
 def prior_scale(how: FitHow, observed: Observed) -> Floats:
     """The prior's scale that these sets (``picks``) make likeliest, if the data are to choose it."""
-    return scale_of(observed.problem(how.half, how.settings, how.rig), how.settings)
+    return scale_of(how.problem(observed), how.settings)
 
 
 def picks(count: int) -> Ints:
@@ -330,7 +334,7 @@ def _fits(how: FitHow, stretch: Stretch) -> tuple[Ints, Fit]:
     observed = observe(series, how.half, how.rig, how.instants)
     if how.smooth_s == 0:
         observed = observed[own]
-        fits = fit_each(observed.problem(how.half, how.settings, how.rig), how.settings, how.prior_scale)
+        fits = fit_each(how.problem(observed), how.settings, how.prior_scale)
     else:
         fits, observed = _smoothed(how, series, observed)[own], observed[own]
     return observed.points, with_residuals(how.half, fits, observed.xyz_m)
@@ -341,8 +345,7 @@ def _smoothed(how: FitHow, series: MarkerSeries, observed: Observed) -> Fit:
     if np.any(np.diff(time_s) <= 0):
         raise UsageError(f"{series.side} wing: times of the sets do not grow; smoothing in time needs that they do")
     assert how.prior_scale is not None
-    posed = observed.problem(how.half, how.settings, how.rig)
-    return smooth_fits(posed, how.settings, time_s, how.prior_scale, how.smooth_s)
+    return smooth_fits(how.problem(observed), how.settings, time_s, how.prior_scale, how.smooth_s)
 
 
 def _from_file(how: FitHow, side: str, path: Path) -> ReferenceShape:
@@ -353,8 +356,8 @@ def _from_file(how: FitHow, side: str, path: Path) -> ReferenceShape:
     if series is None:
         raise UsageError(f"{path}: has no {side} wing; give a reference with every wing of this recording")
     places = observe(as_in(how.half, series), how.half, None, InstantSettings())
-    fits = fit_each(places.problem(how.half, how.settings, None), how.settings, how.prior_scale)
     shared = shared_errors(table).get(side)
+    fits = fit_each(places.problem(how.half, how.settings, None, shared), how.settings, how.prior_scale)
     same = shared is not None and how.shared is not None and shared.as_in(how.shared)
     found = mean_of(str(path), how.half, fits, shared, same=same)
     if found is None:

@@ -17,6 +17,8 @@ from reconstruct.fit import Fit, marker_places
 from reconstruct.rotation import Array
 from reconstruct.wing import HalfWing
 
+_WEIGHTED = 1e-3  # of the largest direction: smaller ones are left out of the fit's weights
+
 
 @dataclass(frozen=True, eq=False)
 class SharedError:
@@ -30,6 +32,23 @@ class SharedError:
         """Whether both are the errors of one calibration, mount and kind of light, so that one draw is in both."""
         return self.light == other.light and self.rig.to_dict() == other.rig.to_dict()
 
+    def of_markers(self, half: HalfWing, xyz_m: Array) -> Array:
+        """(F, M, 3, r) how markers measured at ``xyz_m`` (F, M, 3) move with independent unit errors; 0 where NaN.
+
+        The r directions are those that move the unloaded wing's markers, for the fit's weights; the rest is left out.
+        """
+        up = half.beam.rest.R_body_section[half.marker_node][:, :, 2]
+        at_rest = self._moved(half.rest_marker_m, up)
+        _, size, direction = np.linalg.svd(at_rest.reshape(-1, at_rest.shape[2]), full_matrices=False)
+        kept = direction[size > _WEIGHTED * size[0]].T
+        moved = self._moved(xyz_m.reshape(-1, 3), np.tile(up, (len(xyz_m), 1))) @ kept
+        return np.asarray(moved.reshape(*xyz_m.shape, -1))
+
+    def _moved(self, points_m: Array, up: Array) -> Array:
+        """(n, 3, P) how points (n, 3) of a surface with normals ``up`` move by unit errors; 0 out of view."""
+        moved = shared_jacobian(self.rig, points_m, Surface(self.light, up)) @ self.root
+        return np.asarray(np.where(np.isfinite(moved), moved, 0.0))
+
     def of_shapes(self, half: HalfWing, fits: Fit) -> Array:
         """R (F, N + 1, 4, P) of F fits: the shift of the nodes (m, body frame) and of twist (rad) by each unit error.
 
@@ -41,9 +60,8 @@ class SharedError:
         good = fits if fits.converged.all() else fits[fits.converged]
         places = marker_places(half, good)
         up = good.R_body_section[:, half.marker_node, :, 2]
-        J = shared_jacobian(self.rig, places.reshape(-1, 3), Surface(self.light, up.reshape(-1, 3))) @ self.root
-        J = np.where(np.isfinite(J), J, 0.0)  # out of view, and so not in use
-        R[fits.converged] = good.moved_by(J.reshape(*places.shape, -1))
+        moved = self._moved(places.reshape(-1, 3), up.reshape(-1, 3))
+        R[fits.converged] = good.moved_by(moved.reshape(*places.shape, -1))
         return R
 
 

@@ -124,6 +124,21 @@ def test_symmetric_motion_is_a_mirror_image(world: World) -> None:
     assert left * [1, -1, 1] == pytest.approx(right, abs=1e-15)
 
 
+def test_lights_are_off_their_places_as_stated_and_stay_where_they_are(world: World) -> None:
+    placed = dataclasses.replace(world, leds=dataclasses.replace(world.leds, placement_sigma_m=2e-4))
+    times = np.repeat(world.epoch_ns + TIMES[:, None], 18, axis=1)
+    off = []
+    for side in SIDES:
+        drawn, frames = LedMotion(world, side).centres(times)
+        found, _ = LedMotion(placed, side).centres(times)
+        off.append(np.einsum("tnba,tnb->tna", frames, found - drawn))
+    assert np.ptp(off, axis=1) == pytest.approx(0.0, abs=1e-12)
+    first = np.array(off)[:, 0]
+    # 108 draws: their spread is known to 7 %
+    assert np.sqrt(np.mean(first**2)) == pytest.approx(2e-4, rel=0.2)
+    assert not np.allclose(first[0], first[1])
+
+
 @pytest.mark.parametrize("side", SIDES)
 def test_motion_is_that_of_a_flexible_wing_and_not_of_rubber(world: World, side: str) -> None:
     times = world.epoch_ns + np.arange(0, 30_000, 5)[:, None] * 1_000_000

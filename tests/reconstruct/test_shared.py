@@ -8,7 +8,7 @@ from scipy.stats import binomtest
 
 from process.camera_model import CameraModel, Light, MarkerLayout, Rig, RigSide, StereoPair
 from process.shared_error import shared_covariance, with_rig
-from reconstruct.fit import fit_frame
+from reconstruct.fit import fit_each, fit_frame, marker_problem
 from reconstruct.posterior import Fit
 from reconstruct.reference import mean_of
 from reconstruct.shared import SharedError, shared_errors, sigma_of
@@ -93,6 +93,31 @@ def test_shapes_and_displacements_hold_the_truth(xhale, closed_form, side, share
     assert binomtest(inside, draws, 0.95).pvalue > 0.01
     assert binomtest(inside_moved, draws, 0.95).pvalue > 0.01
     assert np.mean(squared, axis=0) == pytest.approx([1.0, 1.0], abs=4 * np.sqrt(2 / draws))
+
+
+def test_weights_that_know_of_shared_errors(xhale, closed_form, side, shared):
+    """300 rigs and their noise: the shape is better than by noise's weights alone, and bands still hold the truth."""
+    truth = closed_form(xhale.right, 0.25, 2.0, 0.01)
+    rng, draws = np.random.default_rng(12), 300
+    xyz = np.array([_as_measured(side, rng.normal(size=30) * SIGMA, rng.normal() * 5e-4, truth) for _ in range(draws)])
+    xyz += 1e-4 * rng.standard_normal(xyz.shape)
+    cov = np.tile(NOISE, (*xyz.shape[:2], 1, 1))
+    rms_m = []
+    for known in (None, shared.of_markers(xhale.right, xyz)):
+        fits = fit_each(marker_problem(xhale.right, xyz, cov, xhale.fit, known), xhale.fit, np.ones(4))
+        assert fits.converged.all()
+        error = fits.position_m - truth.position_m
+        rms_m.append(np.sqrt(np.mean(np.sum(error**2, axis=2))))
+    assert rms_m[1] < 0.9 * rms_m[0]
+    noise = np.concatenate([fits.sigma_position_m, fits.sigma_twist_rad[:, :, None]], axis=2)
+    sigma = np.hypot(noise, sigma_of(shared.of_shapes(xhale.right, fits)))
+    place = rng.integers(4, len(truth.position_m), draws)
+    for axis in (0, 2):
+        score = error[np.arange(draws), place, axis] / sigma[np.arange(draws), place, axis]
+        # the marker model's sigma and the prior make bands wider than these errors: they may hold more than 95 %
+        assert binomtest(int(np.sum(np.abs(score) < 1.96)), draws, 0.95, alternative="less").pvalue > 0.01
+    # what is new in every set is what it was: the noise, and less of it than of what is shared
+    assert np.median(noise[:, -1, 2]) < np.median(sigma[:, -1, 2])
 
 
 def test_a_table_that_does_not_state_its_errors_has_none(side):
