@@ -114,10 +114,17 @@ class FitHow:
     """what displacements are counted from; None: the unloaded wing"""
     rig: RigSide | None = None
     """cameras whose pixels are fitted; None: markers' places are"""
+    from_recorded: bool = False
+    """displacements are counted from a recorded shape, which has nearly the same shared error"""
 
     def problem(self, observed: Observed) -> Unscaled:
-        """What the sets' fits are to explain. Smoothing in time takes all errors for new in every set."""
-        return observed.problem(self.half, self.settings, self.rig, self.shared if self.smooth_s == 0 else None)
+        """What the sets' fits are to explain.
+
+        Weights know of shared errors unless these cancel in what is asked for, or sets are smoothed in time, which
+        takes all errors for new in every set.
+        """
+        known = None if self.from_recorded or self.smooth_s > 0 else self.shared
+        return observed.problem(self.half, self.settings, self.rig, known)
 
     @property
     def around_s(self) -> float:
@@ -175,7 +182,8 @@ def fit_series(
     start_ns = min(int(series.frame_timestamp_ns.min()) for series in whole.values())
     jobs = []
     for side, series in whole.items():
-        how = fit_how(wing, side, given, smooth_s, (shared or {}).get(side))
+        known = (shared or {}).get(side)
+        how = fit_how(wing, side, given, smooth_s, known, from_recorded=reference is not None)
         picked = np.flatnonzero(enough_markers(series))
         picked = picked[picks(picked.size)]
         how = replace(how, prior_scale=prior_scale(how, observe(series, how.half, how.rig, how.instants)[picked]))
@@ -202,6 +210,8 @@ def fit_how(
     smooth_s: float,
     shared: SharedError | None,
     rig: RigSide | None = None,
+    *,
+    from_recorded: bool = False,
 ) -> FitHow:
     """How the sets of one side are fitted, but for the prior's scale and the reference.
 
@@ -211,7 +221,7 @@ def fit_how(
         raise UsageError(f"the wing {wing.name!r} has no [fit] section: say where its loads act (load_stations_m)")
     if smooth_s > 0 and wing.fit.loads != "everywhere":
         raise UsageError('smoothing in time needs loads = "everywhere" in the wing file\'s [fit]')
-    return FitHow(wing.half(side), wing.fit, instants, smooth_s, shared, rig=rig)
+    return FitHow(wing.half(side), wing.fit, instants, smooth_s, shared, rig=rig, from_recorded=from_recorded)
 
 
 def stretches(series: MarkerSeries, around_s: float) -> list[Stretch]:
@@ -357,7 +367,7 @@ def _from_file(how: FitHow, side: str, path: Path) -> ReferenceShape:
         raise UsageError(f"{path}: has no {side} wing; give a reference with every wing of this recording")
     places = observe(as_in(how.half, series), how.half, None, InstantSettings())
     shared = shared_errors(table).get(side)
-    fits = fit_each(places.problem(how.half, how.settings, None, shared), how.settings, how.prior_scale)
+    fits = fit_each(places.problem(how.half, how.settings, None), how.settings, how.prior_scale)
     same = shared is not None and how.shared is not None and shared.as_in(how.shared)
     found = mean_of(str(path), how.half, fits, shared, same=same)
     if found is None:

@@ -84,7 +84,15 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
     ),
     "beam": (
         Step(
-            "the beam's slow tests: coverage, 5,000 frames, the paper's way", "pytest -q -s -m slow tests/reconstruct"
+            "the beam's slow tests: coverage, 5,000 frames, the paper's way",
+            "pytest -q -s -m slow tests/reconstruct/test_fit_accuracy.py --durations=0",
+        ),
+        Step(
+            "time of a fit: a set at a time, a block of sets, with bands and tables", "python tests/benchmarks/fit.py"
+        ),
+        Step(
+            "forward solve beside OpenSees (`pip install openseespy`), same case, same run",
+            "python tests/reconstruct/beside_opensees.py",
         ),
     ),
     "reconstruct": (
