@@ -88,14 +88,9 @@ class FitPlan:
     def of(self, side: str) -> FitHow:
         """How its sets of one side are fitted, but for the prior's scale and the reference."""
         rig = None if self.cameras is None else self.cameras.sides.get(side)
+        recorded = self.reference is not None
         return fit_how(
-            self.wing,
-            side,
-            self.instants,
-            self.smooth_s,
-            self.shared.get(side),
-            rig,
-            from_recorded=self.reference is not None,
+            self.wing, side, self.instants, self.smooth_s, self.shared.get(side), rig, from_recorded=recorded
         )
 
 
