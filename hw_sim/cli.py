@@ -39,7 +39,7 @@ def world(
     leds: Annotated[str, typer.Option(help="On the wing: disc, or dome (bulbs that stand off the wing).")] = "disc",
     placement_mm: Annotated[
         float, typer.Option(min=0.0, help="One sigma by which they are off their places on the wing, each axis.")
-    ] = 0.2,
+    ] = 0.0,
     fuselage_lights: Annotated[
         bool, typer.Option("--fuselage-lights", help="Six reference lights a side, on in the survey and in flight.")
     ] = False,

@@ -35,6 +35,7 @@ RIG_STOP_S = 60.0
 _MARK = ".wingshape-demo"  # says that a folder may be replaced by the next demonstration
 BOARD = "10x7"  # inner corners
 SQUARE_MM = "30"
+PLACEMENT_MM = "0.2"  # of the lights: what the wing file says (marker_model_sigma_m)
 
 
 def demo(
@@ -125,7 +126,10 @@ def _check_space(out: Path, world: World, triggers: int) -> None:
 def _prepare(steps: Steps, hidden: Path, seed: int, scale: int) -> None:
     """What happens before the flight: the world, the calibration day, the rig's and the wing's files."""
     world_path = hidden / "world.toml"
-    steps.run("wingsim", "world", "-o", str(world_path), "--seed", str(seed), "--scale", str(scale))
+    steps.run(
+        "wingsim", "world", "-o", str(world_path), "--seed", str(seed), "--scale", str(scale),
+        "--placement-mm", PLACEMENT_MM,
+    )  # fmt: skip
     steps.run("wingsim", "sessions", "--world", str(world_path), "-o", "ground")
     for side in SIDES:
         images = f"ground/board_{side}/cam"
