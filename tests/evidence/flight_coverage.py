@@ -1,7 +1,7 @@
 """Whether bands hold the truth: short flights, each mounted, calibrated and surveyed anew, one draw of each counted.
 
-``python flight_coverage.py FOLDER [--flights 500] [--workers 2]`` prints the figures. What it gets done is kept in
-``FOLDER/flight-coverage.jsonl``, a line a seed: stopped, it goes on where it was.
+``python flight_coverage.py FOLDER [--flights 500] [--first 0] [--workers 2]`` prints the figures. What it gets done
+is kept in ``FOLDER/flight-coverage.jsonl``, a line a seed: stopped, it goes on where it was.
 """
 
 import argparse
@@ -26,25 +26,27 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("folder", type=Path)
     options.add_argument("--flights", type=int, default=500)
+    options.add_argument("--first", type=int, default=0, help="seed of the first flight")
     options.add_argument("--workers", type=int, default=2)
     given = options.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     kept = given.folder / "flight-coverage.jsonl"
     lines = kept.read_text().splitlines() if kept.exists() else []
     done = {one.seed: one for one in (Drawn(**json.loads(line)) for line in lines)}
-    todo = [seed for seed in range(given.flights) if seed not in done]
+    wanted = range(given.first, given.first + given.flights)
+    todo = [seed for seed in wanted if seed not in done]
     with ProcessPoolExecutor(given.workers, get_context("spawn")) as pool, kept.open("a") as file:
         for one in pool.map(fly, todo):
             done[one.seed] = one
             file.write(json.dumps(asdict(one)) + "\n")
             file.flush()
-    print("\n".join(table([done[seed] for seed in range(given.flights)])))
+    print("\n".join(table([done[seed] for seed in wanted])))
 
 
 def table(flights: Sequence[Drawn]) -> list[str]:
     """The figures as markdown."""
     count = len(flights)
-    rows = [f"Seeds 0 to {count - 1}, {count} flights.", ""]
+    rows = [f"Seeds {flights[0].seed} to {flights[-1].seed}, {count} flights.", ""]
     rows += ["| 95 % band of | holds the truth | p | squared error over variance | median error | median sigma |"]
     rows += ["|---|---|---|---|---|---|"]
     for name, inside, squares, error, sigma in (
