@@ -91,6 +91,7 @@ def test_each_is_what_it_is_alone(result, week, tmp_path):
         assert same(out / f"monday/{name}.parquet", tmp_path / f"alone/{name}.parquet"), name
 
 
+@pytest.mark.slow
 def test_run_again_it_keeps_what_is_done(result, week, tmp_path):
     """Unless other files are asked for."""
     out = tmp_path / "results"
