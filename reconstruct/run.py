@@ -29,7 +29,7 @@ from process.tables import MARKER_SCHEMA, TableWriter, write_table
 from process.workers import Crew, crew, usable_cores
 from reconstruct.air_table import AIR, SpecificForce, air_table
 from reconstruct.animation import remove_animation, write_animation
-from reconstruct.assemble import Target, assemble
+from reconstruct.assemble import Assembled, Target, assemble
 from reconstruct.beside import Beside, beside_flight, beside_markers
 from reconstruct.compare import Comparison, compare
 from reconstruct.dense import NETCDF, write_netcdf
@@ -170,21 +170,8 @@ def run_job(
         found = assemble(store, measured, fitted, target)
         _write_air(job, wing, found.frames, note)
         clock.written = time.monotonic()
-    hangs = recorded_hangs(wing, found.wings)
     summary = {
-        "version": version("wingshape"),
-        "wing": wing.name,
-        **summarise(found.tallies, found.frames),
-        "reference": found.wings.column("reference")[0].as_py(),
-        "at_rest": {one.side: one.as_dict() for one in hangs},
-        "direct": job.direct,
-        "root_motion": {side: one.figures(wing.half(side).rest_position_m[-1]) for side, one in plan.root.items()},
-        "smoothed_s": job.smooth_s,
-        "warnings": [
-            *_warnings(wing, sampled(fitted, wing, store, source.name)),
-            *(one.sentence() for one in hangs if abs(one.misfit) > DOUBTFUL_SIGMAS),
-        ],
-        **holes(found.frames),
+        **_figures(job, wing, plan, found, sampled(fitted, wing, store, source.name)),
         **_timing(clock, found.frames, resumed, source.reading_s),
         "peak_mb": memory.peak_bytes / 1e6,
         **note,
@@ -349,6 +336,28 @@ def _report(job: Job, source: _Source, summary: dict[str, Any], frames: pa.Table
     if job.animation:
         write_animation(result, job.out, _telling(progress, "film", 0.0))
         summary["timing_s"]["animation"] = time.monotonic() - began - summary["timing_s"]["report"]
+
+
+def _figures(
+    job: Job, wing: Wing, plan: FitPlan, found: Assembled, sample: Mapping[str, MarkerSeries]
+) -> dict[str, Any]:
+    """What a summary says of the flight, not of how it was made."""
+    hangs = recorded_hangs(wing, found.wings)
+    return {
+        "version": version("wingshape"),
+        "wing": wing.name,
+        **summarise(found.tallies, found.frames),
+        "reference": found.wings.column("reference")[0].as_py(),
+        "at_rest": {one.side: one.as_dict() for one in hangs},
+        "direct": job.direct,
+        "root_motion": {side: one.figures(wing.half(side).rest_position_m[-1]) for side, one in plan.root.items()},
+        "smoothed_s": job.smooth_s,
+        "warnings": [
+            *_warnings(wing, sample),
+            *(one.sentence() for one in hangs if abs(one.misfit) > DOUBTFUL_SIGMAS),
+        ],
+        **holes(found.frames),
+    }
 
 
 def _write_also(job: Job, store: PartStore, fitted: Sequence[Key], note: Mapping[str, Any]) -> None:
