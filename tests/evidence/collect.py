@@ -101,8 +101,8 @@ SECTIONS: dict[str, tuple[Step, ...]] = {
             "python tests/evidence/reconstruct_speed.py {target}",
         ),
         Step(
-            "95 % bands over 500 short flights, each with a calibration of its own",
-            "python tests/evidence/flight_coverage.py {target}",
+            "95 % bands over 1,000 short flights, each with a calibration of its own",
+            "python tests/evidence/flight_coverage.py {target} --flights 1000",
         ),
         Step(
             "killed and resumed, one process or several or Dask: the same",

@@ -1,4 +1,4 @@
-"""95 % bands of rendered flights against the truth, each flight with a calibration of its own; evidence flies 500.
+"""95 % bands of rendered flights against the truth, each flight with a calibration of its own; evidence flies 1,000.
 
 A flight's bands share one calibration's error: only over many flights do 95 % of them hold the truth.
 """
