@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from capture.errors import ProcessError
 from process.board import Board
-from process.bundle import Adjustment, Estimate, Freedom, adjust, residuals_of, rms_px, rotation_matrix
+from process.bundle import INTRINSICS, Adjustment, Estimate, Freedom, adjust, residuals_of, rms_px, rotation_matrix
 from process.camera_model import CameraModel, StereoPair, pose_matrix
 from process.shared_error import triangulated_by_calibration
 
@@ -166,36 +166,50 @@ def _odd_corners(residuals_px: Array) -> dict[tuple[int, int, int], float]:
 
 
 @dataclass(frozen=True, eq=False)
+class _Library:
+    """Where one of OpenCV's own solvers ended."""
+
+    rms_px: float
+    off_mm: float
+    """what it places elsewhere than the optimum of its stage does: of a camera alone the farthest board, of the pose
+    between them a point as far away"""
+
+
+@dataclass(frozen=True, eq=False)
 class _Stages:
     alone: list[Adjustment]
     two_stage: Adjustment
     final: Adjustment
     freedom: Freedom
-    library_rms_px: tuple[float, float, float]
+    library: tuple[_Library, _Library, _Library]
+    """cam0 alone, cam1 alone, the pose between"""
 
 
 def _alone(
     corners_px: Array, board: Board, size_px: tuple[int, int], settings: CalibrationSettings
-) -> list[tuple[Adjustment, float]]:
-    """Each camera alone on the nominal board, and the RMS at which OpenCV's own solver ended."""
+) -> list[tuple[Adjustment, _Library]]:
+    """Each camera alone on the nominal board, and where OpenCV's own solver ended."""
     freedom = Freedom(distortion_terms=settings.distortion_terms)
     starts = [start_alone(corners, board, size_px, settings.distortion_terms) for corners in corners_px]
-    return [
-        (adjust(corners[None], start, freedom), library_rms_px)
-        for corners, (start, library_rms_px) in zip(corners_px, starts, strict=True)
-    ]
+    found = []
+    for corners, (start, ended_px) in zip(corners_px, starts, strict=True):
+        own = adjust(corners[None], start, freedom)
+        farthest = own.estimate.views[:, 5].argmax()
+        moved_m = (start.views - own.estimate.views)[farthest, 3:]
+        found.append((own, _Library(ended_px, 1000.0 * float(np.linalg.norm(moved_m)))))
+    return found
 
 
 def _solve(
     corners_px: Array,
-    alone: list[tuple[Adjustment, float]],
+    alone: list[tuple[Adjustment, _Library]],
     start: Estimate,
     size_px: tuple[int, int],
     settings: CalibrationSettings,
 ) -> _Stages:
     freedom = Freedom(intrinsics=False)
     two_stage = final = adjust(corners_px, start, freedom)
-    stereo_rms_px = _library_stereo_rms_px(corners_px, start, size_px)
+    stereo = _library_stereo(corners_px, start, two_stage.estimate, size_px)
     if settings.method is Method.joint:
         board_moves = not settings.nominal_board and corners_px.shape[1] >= MIN_VIEWS_FOR_PRINT
         freedom = Freedom(distortion_terms=settings.distortion_terms, board=board_moves)
@@ -204,7 +218,7 @@ def _solve(
             for _ in range(2):  # the noise that the prior is weighed against is that of a board that may bow
                 freedom = replace(freedom, bow_prior_px_per_m=final.sigma_px / settings.flatness_m)
                 final = adjust(corners_px, two_stage.estimate, freedom)
-    return _Stages([one for one, _ in alone], two_stage, final, freedom, (alone[0][1], alone[1][1], stereo_rms_px))
+    return _Stages([one for one, _ in alone], two_stage, final, freedom, (alone[0][1], alone[1][1], stereo))
 
 
 def refit(corners_px: Array, start: Estimate, calibration: Calibration) -> Adjustment:
@@ -261,18 +275,18 @@ def _join(alone: list[Adjustment]) -> Estimate:
     return Estimate(intrinsics, stereo, alone[0].estimate.views, alone[0].estimate.board_m)
 
 
-def _library_stereo_rms_px(corners_px: Array, start: Estimate, size_px: tuple[int, int]) -> float:
+def _library_stereo(corners_px: Array, start: Estimate, own: Estimate, size_px: tuple[int, int]) -> _Library:
     """Where cv2.stereoCalibrate ends with the intrinsics held: some versions stop early."""
     plane = np.column_stack([start.board_m, np.zeros(len(start.board_m))]).astype(np.float32)
     both = np.asarray(np.isfinite(corners_px).all(axis=(0, 3)))
     enough = np.flatnonzero(both.sum(axis=1) >= LEAST_CORNERS)
     if not len(enough):
-        return np.nan
+        return _Library(np.nan, np.nan)
     views = [
         [camera[view, both[view]].astype(np.float32).reshape(-1, 1, 2) for view in enough] for camera in corners_px
     ]
     cameras = [CameraModel.from_intrinsics(*size_px, values) for values in start.intrinsics]
-    rms, *_ = cv2.stereoCalibrate(
+    rms, _, _, _, _, R, t, *_ = cv2.stereoCalibrate(
         [plane[both[view]] for view in enough],
         views[0],
         views[1],
@@ -284,7 +298,10 @@ def _library_stereo_rms_px(corners_px: Array, start: Estimate, size_px: tuple[in
         flags=cv2.CALIB_FIX_INTRINSIC,
         criteria=CRITERIA,
     )
-    return float(rms)
+    pair = StereoPair(cameras[0], cameras[1], pose_matrix(own.stereo[:3], own.stereo[3:]))
+    response = triangulated_by_calibration(pair, pair.middle_of_view(float(own.views[:, 5].max()))[None])[0]
+    moved = np.concatenate([cv2.Rodrigues(R)[0].ravel(), t.ravel()]) - own.stereo
+    return _Library(float(rms), 1000.0 * float(np.linalg.norm(response[:, 2 * INTRINSICS :] @ moved)))
 
 
 def _result(
@@ -311,7 +328,7 @@ def _result(
         stereo_rms_px=final.rms_px,
         two_stage_rms_px=stages.two_stage.rms_px,
         stereo_to_mono_ratio=_stereo_to_mono(stages),
-        library_rms_px=stages.library_rms_px,
+        library_rms_px=(stages.library[0].rms_px, stages.library[1].rms_px, stages.library[2].rms_px),
         sigma_px=final.sigma_px,
         gradient=final.gradient,
         board_m=estimate.board_m,
@@ -343,14 +360,18 @@ def _stereo_to_mono(stages: _Stages) -> float:
 
 def _warnings(stages: _Stages, settings: CalibrationSettings, size_px: tuple[int, int], views: int) -> list[str]:
     found = []
+    farthest_m = float(stages.two_stage.estimate.views[:, 5].max())
     for name, library, own in zip(
         ("cv2.calibrateCamera of cam0", "cv2.calibrateCamera of cam1", "cv2.stereoCalibrate"),
-        stages.library_rms_px,
-        (*(one.rms_px for one in stages.alone), stages.two_stage.rms_px),
+        stages.library,
+        (*stages.alone, stages.two_stage),
         strict=True,
     ):
-        if library > own * SAME_OPTIMUM + 1e-5:  # OpenCV's corners are single precision
-            found.append(f"{name} stopped early at {library:.4f} px; the optimum used here has {own:.4f} px")
+        if library.rms_px > own.rms_px * SAME_OPTIMUM + 1e-5:  # OpenCV's corners are single precision
+            found.append(
+                f"{name} stopped early at {library.rms_px:.4f} px; the optimum used here has {own.rms_px:.4f} px, and "
+                f"places what is {farthest_m:.2g} m away {library.off_mm:.2f} mm elsewhere"
+            )
     ratio = _stereo_to_mono(stages)
     if ratio > MOST_STEREO_TO_MONO:
         found.append(

@@ -3,6 +3,7 @@
 import html
 import json
 import os
+import re
 from pathlib import Path
 
 import cv2
@@ -159,6 +160,31 @@ def test_paper_method_reaches_the_optimum_of_both_stages():
     assert result.stereo_rms_px <= result.library_rms_px[2] + 1e-5
     # noise of 0.1 px an axis is 0.1414 px a corner, less the freedoms used: sqrt(1 − 81 / 1680) for one camera
     assert result.alone_rms_px[0] == pytest.approx(0.1414 * np.sqrt(1 - 81 / 1680), rel=0.07)
+
+
+def test_a_library_that_stops_early_is_told_in_pixels_and_millimetres(monkeypatch):
+    """As some versions' stereoCalibrate does; what it costs by OpenCV's own triangulation."""
+    to_the_end, found = cv2.stereoCalibrate, []
+
+    def stop_early(*given, **options):
+        rms, *others = to_the_end(*given, **options)
+        others[5] = others[5] + [[1e-3], [0.0], [2e-3]]
+        found.extend([1.5 * rms, others[4], others[5]])
+        return 1.5 * rms, *others
+
+    monkeypatch.setattr(cv2, "stereoCalibrate", stop_early)
+    result = calibrate(see(printed(4), board_poses(12, 5), 0.05, 6), BOARD, SIZE, CalibrationSettings(Method.paper))
+    (said,) = result.warnings
+    assert said.startswith(f"cv2.stereoCalibrate stopped early at {found[0]:.4f} px; the optimum used here has")
+    farthest_m = float(result.estimate.views[:, 5].max())
+    own, point = result.pair, result.pair.middle_of_view(farthest_m)
+    seen = own.cam0.project(point), own.cam1.project(own.T_cam1_cam0[:3, :3] @ point + own.T_cam1_cam0[:3, 3])
+    ideal = [camera.undistort(pixel).T for camera, pixel in zip((own.cam0, own.cam1), seen, strict=True)]
+    placed = cv2.triangulatePoints(np.eye(3, 4), np.column_stack(found[1:]), *ideal).ravel()
+    off_mm = 1000.0 * np.linalg.norm(placed[:3] / placed[3] - point)
+    assert float(re.search(rf"{farthest_m:.2g} m away ([\d.]+) mm elsewhere", said)[1]) == pytest.approx(
+        off_mm, rel=0.05
+    )
 
 
 def test_a_view_of_another_instant_is_left_out_and_named():
