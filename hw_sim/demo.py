@@ -128,7 +128,7 @@ def _prepare(steps: Steps, hidden: Path, seed: int, scale: int) -> None:
     world_path = hidden / "world.toml"
     steps.run(
         "wingsim", "world", "-o", str(world_path), "--seed", str(seed), "--scale", str(scale),
-        "--placement-mm", PLACEMENT_MM,
+        "--fuselage-lights", "--placement-mm", PLACEMENT_MM,
     )  # fmt: skip
     steps.run("wingsim", "sessions", "--world", str(world_path), "-o", "ground")
     for side in SIDES:
