@@ -21,6 +21,7 @@ from process.calibration_quality import Quality, judge, working_ranges_m
 from process.calibration_recording import find_in_recording
 from process.calibration_report import write_report
 from process.calibration_session import (
+    Session,
     SessionCalibration,
     calibrate_session,
     find_session,
@@ -72,24 +73,15 @@ def calibrate(
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Calibrate a camera pair from images, or a recording, of a board seen by both cameras at the same time."""
-    if distortion_terms not in (2, 5):
-        raise UsageError(f"--distortion-terms {distortion_terms}: 2 or 5")
+    settings = _settings(method, nominal_board, distortion_terms, flatness_mm)
     if folds < 0 or folds == 1:
         raise UsageError(f"--folds {folds}: 2 or more, or 0 for no cross-validation")
-    if not 0.0 <= flatness_mm <= 100.0 or (flatness_mm and method is Method.paper):
-        raise UsageError(f"--flatness-mm {flatness_mm:g}: 0 to 100 mm, and not with --method paper")
     target = _board(board, square_mm, charuco, marker_mm)
     source = _source(flight or [], side, cam0, cam1)
     for path in filter(None, (output, report)):
         if not path.resolve().parent.is_dir():
             raise ProcessError(f"{path.parent}: no such folder to write to; make it first")
-    with _progress() as progress:
-        if isinstance(source, list):
-            session = find_session(source, target, workers, progress, finders_of(method))
-        else:
-            session = find_in_recording(*source, target, workers, progress)
-    settings = CalibrationSettings(method, nominal_board, distortion_terms, flatness_mm / 1000.0)
-    result = calibrate_session(session, settings)
+    result = calibrate_session(_session(source, target, method, workers), settings)
     quality = judge(result.calibration, result.corners_px, target, folds)
     summary = summarise(result, target, quality)
     command = shlex.join(["wingproc", *sys.argv[1:]])
@@ -102,10 +94,7 @@ def calibrate(
         camera_rms_px=calibration.camera_rms_px,
         stereo_rms_px=calibration.stereo_rms_px,
         provenance=made,
-        calibration=summary["calibration"],
-        board=summary["board"],
-        views=summary["views"],
-        quality=summary["quality"],
+        **{key: summary[key] for key in ("calibration", "board", "views", "quality")},
     )
     if report is not None:
         write_report(report, result, quality, target, summary, command)
@@ -115,6 +104,23 @@ def calibrate(
         say_json({**summary, "output": str(output)})
     else:
         _print(summary, output, report)
+
+
+def _settings(method: Method, nominal_board: bool, distortion_terms: int, flatness_mm: float) -> CalibrationSettings:
+    if distortion_terms not in (2, 5):
+        raise UsageError(f"--distortion-terms {distortion_terms}: 2 or 5")
+    if not 0.0 <= flatness_mm <= 100.0 or (flatness_mm and method is Method.paper):
+        raise UsageError(f"--flatness-mm {flatness_mm:g}: 0 to 100 mm, and not with --method paper")
+    return CalibrationSettings(method, nominal_board, distortion_terms, flatness_mm / 1000.0)
+
+
+def _session(
+    source: list[tuple[Path, Path]] | tuple[Recording, str], board: Board, method: Method, workers: int
+) -> Session:
+    with _progress() as progress:
+        if isinstance(source, list):
+            return find_session(source, board, workers, progress, finders_of(method))
+        return find_in_recording(*source, board, workers, progress)
 
 
 def _source(
