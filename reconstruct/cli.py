@@ -31,7 +31,7 @@ from reconstruct.report import write_report
 from reconstruct.result import COMPARISON, REPORT, SUMMARY, read_json_object, read_result
 from reconstruct.run import Job, Progress, Step, run_comparison, run_job
 from reconstruct.static import static
-from reconstruct.summary import motion_sentence, verdict
+from reconstruct.summary import verdict
 from reconstruct.wing import example_path
 
 SHOWN_WARNINGS = 20
@@ -137,8 +137,6 @@ def _run_one(job: Job, *, json: bool) -> None:
     say(f"markers seen    {summary['markers_seen_percent']:.2f} %")
     say(f"residual RMS    {summary['residual_rms_mm']:.3f} mm")
     say(f"tip sigma       {summary['sigma_tip_mm']:.2f} mm, {summary['sigma_tip_twist_deg']:.3f} deg (median)")
-    for side, moved in summary["root_motion"].items():
-        say(f"{'root ' + side:<15} {motion_sentence(moved)}")
     say(f"verdict         {' '.join(verdict(summary))}")
     say(f"time            {summary['wall_s']:.1f} s{_speed(summary)}, {summary['peak_mb']:.0f} MB")
     if summary["sets_without_shape"]:

@@ -115,14 +115,6 @@ def _median(values: Floats) -> float | None:
     return float(np.median(known)) if known.size else None
 
 
-def motion_sentence(moved: Mapping[str, Any]) -> str:
-    """What the cameras' motion against the fuselage was, by a side's figures under ``root_motion``."""
-    return (
-        f"cameras moved by up to {moved['turn_mrad']:.2f} mrad, {moved['shift_mm']:.2f} mm since the {moved['since']}: "
-        f"{moved['tip_rms_mm']:.2f} +- {moved['sigma_tip_mm']:.2f} mm RMS at the tip, taken out"
-    )
-
-
 def verdict(summary: Mapping[str, Any]) -> list[str]:
     """What a reader should know of the data's quality, most important first; starts with one word."""
     seen, fitted = summary["markers_seen_percent"], summary["converged_percent"]
@@ -143,9 +135,18 @@ def verdict(summary: Mapping[str, Any]) -> list[str]:
     if ratio is not None:
         lines.append(_agreement(ratio))
     lines += summary.get("warnings", [])
+    lines += [_moved(side, found) for side, found in summary.get("root_motion", {}).items()]
     if summary["triggers_missing"]:
         lines.append(f"{summary['triggers_missing']} triggers between the first and the last have no set at all.")
     return lines
+
+
+def _moved(side: str, found: Mapping[str, Any]) -> str:
+    """What the cameras' motion against the fuselage was, by a side's figures under ``root_motion``."""
+    return (
+        f"The {side} cameras moved by up to {found['turn_mrad']:.2f} mrad and {found['shift_mm']:.2f} mm since the "
+        f"{found['since']}, {found['tip_rms_mm']:.2f} ± {found['sigma_tip_mm']:.2f} mm RMS at the tip: taken out."
+    )
 
 
 def _agreement(ratio: float) -> str:
