@@ -178,6 +178,8 @@ def scale_of(posed: Unscaled, settings: FitSettings) -> Array:
     """
     if settings.prior_weight != "data":
         return rescaled(STATED, posed.group, np.zeros(1), np.zeros(1), settings.prior_weight)
+    if not len(posed):
+        return STATED
     return _chosen(posed, settings, None)[0]
 
 
