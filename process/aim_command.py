@@ -124,8 +124,8 @@ def _first(folder: Path, expected: int) -> list[Aim]:
 def _live(folder: Path, expected: int) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     known: dict[str, tuple[float, Aim]] = {}
-    aims = _first(folder, expected)
     try:
+        aims = _first(folder, expected)
         with Live(_shown(aims), auto_refresh=False, screen=Console().is_terminal) as live:
             while True:
                 time.sleep(PERIOD_S)

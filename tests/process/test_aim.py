@@ -4,7 +4,6 @@ Blurred discs are integrated here by brute force; whole wings come from the simu
 """
 
 import json
-import signal
 import subprocess
 import threading
 import time
@@ -12,7 +11,7 @@ import time
 import cv2
 import numpy as np
 import pytest
-from field import command, field_in
+from field import command
 from scipy.ndimage import gaussian_filter
 
 from capture.clock import SystemClock
@@ -198,34 +197,3 @@ def test_previews_of_a_recorder(tmp_path):
     writer.stop(5)
     (found,) = json.loads(answer.stdout)
     assert (found["camera"], found["markers"], found["exposure_us"], found["good"]) == ("left/cam0", 12, 2500, True)
-
-
-@pytest.mark.slow
-def test_live_beside_a_recorder_and_then_from_its_flight(tmp_path):
-    with field_in(tmp_path, scale=4) as field:
-        field.start_rig()
-        field.start_recorder()
-        deadline_s = time.monotonic() + 30
-        while (health := read_health(field.health)) is None or health.triggers < 25:
-            assert time.monotonic() < deadline_s
-            time.sleep(0.1)
-        live = subprocess.Popen(
-            command("process", "aim", "--health", field.health),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        time.sleep(5)
-        live.send_signal(signal.SIGINT)
-        shown, complained = live.communicate(timeout=20)
-        assert (live.returncode, complained) == (0, "")
-        assert "right/cam1" in shown
-        seen = json.loads(aim("--health", field.health, "--json").stdout)
-        assert field.recorded()["failures"] == []
-    flight = json.loads(
-        aim(tmp_path / "ssd_left/test_07", tmp_path / "ssd_right/test_07", "--at", 0.8, "--json").stdout
-    )
-    for found in (seen, flight):
-        assert [camera["camera"] for camera in found] == ["left/cam0", "left/cam1", "right/cam0", "right/cam1"]
-        assert {camera["exposure_us"] for camera in found} == {2000}
-        assert min(camera["markers"] for camera in found) >= 16  # of 18: at this size two may run into each other
