@@ -202,7 +202,7 @@ class Grabber(Worker):
         self._ledger.absent(self.place, absence.cause)
         try:
             self._recognise(self._camera.open())
-            self._numbering, self._frame_clock = self._aligned(self._description)
+            self._numbering, self._frame_clock = self._aligned(self._description, self._numbering.last)
             self._ledger.absent(self.place, absence.cause)
             self.arm()
         except CameraError as error:
@@ -294,11 +294,13 @@ class Grabber(Worker):
         self._ledger.lost(self.place, numbered.index, stage, cause)
         self._requeue(grab.slot)
 
-    def _aligned(self, description: CameraDescription) -> tuple[FrameNumbering, FrameClock]:
-        """A camera's counter and clock, of which nothing is known yet."""
+    def _aligned(
+        self, description: CameraDescription, before: tuple[Grab, Numbered] | None = None
+    ) -> tuple[FrameNumbering, FrameClock]:
+        """A camera's counter and clock, of which nothing is known yet, or only what was its last frame ``before``."""
         parts = self._parts
         clock = FrameClock(description, parts.triggers, parts.clock_state, parts.trigger_latency_ns)
-        return FrameNumbering(description, parts.triggers, parts.ledger.decided_below(self.place)), clock
+        return FrameNumbering(description, parts.triggers, parts.ledger.decided_below(self.place), before), clock
 
     @property
     def _gate_name(self) -> str:

@@ -13,6 +13,14 @@ FIRST_REPORT_WAIT_S = 0.2
 
 LEAP_NS = 10_000_000_000
 """What a device's clock may pass between two frames without the computer's clock having noticed."""
+KNOWN_FOR_NS = 60_000_000_000
+"""What may pass of a lost camera's own clock for it to tell a trigger from the next when the camera is back."""
+CLOCK_ERROR = 1e-4
+"""Of a camera's clock, by which it may have gone wrong since; relative."""
+EDGE_ERROR_NS = 1_000_000
+"""By which a trigger may be off its regular time."""
+LATEST_TRIGGERS = 10
+"""By which the first frames may have been late: more is another clock than the one known before."""
 
 
 class Triggers(Protocol):
@@ -50,16 +58,31 @@ class FrameNumbering:
     since the last frame (host time is late when the host is busy, the device's is not), and its frame counter says
     how many of the skipped triggers were exposed. A device whose clock jumps is noticed by frames that fit no trigger,
     or come long before the time that it says has passed: after ``CONFIRMING`` of them in a row it is begun with anew.
+
+    When a camera that was lost comes back and its clock has run on, that clock says which trigger the first frame is
+    of, even if all of the first frames are late.
     """
 
-    def __init__(self, camera: CameraDescription, triggers: Triggers, earliest_index: int = 0) -> None:
-        """``earliest_index`` is the first trigger that a frame can be of."""
+    def __init__(
+        self,
+        camera: CameraDescription,
+        triggers: Triggers,
+        earliest_index: int = 0,
+        before: tuple[Grab, Numbered] | None = None,
+    ) -> None:
+        """``earliest_index``: the first trigger that a frame can be of; ``before``: the ``last`` of the lost camera."""
         self._earliest = earliest_index
+        self._before = before
         self._camera = camera
         self._triggers = triggers
         self._held: list[Grab] = []
         self._last: tuple[Grab, Numbered] | None = None
         self._strays = 0  # frames in a row that were nobody's
+
+    @property
+    def last(self) -> tuple[Grab, Numbered] | None:
+        """The last frame that was numbered, also before the camera was lost."""
+        return self._last or self._before
 
     def feed(self, grab: Grab) -> list[tuple[Grab, Numbered | None]]:
         """Take a frame; the frames that can be told now, in order.
@@ -71,7 +94,7 @@ class FrameNumbering:
             self._strays = 0 if numbered else self._strays + 1
             if self._strays >= CONFIRMING:  # its clock has begun anew
                 self._earliest = self._last[1].index + 1
-                self._last, self._strays = None, 0
+                self._last, self._before, self._strays = None, None, 0
             return [(grab, numbered)]
         self._held.append(grab)
         return self._settle() if len(self._held) >= CONFIRMING else []
@@ -106,7 +129,25 @@ class FrameNumbering:
             first = trigger and self._triggers.nearest(trigger[1] - later_ns, FIRST_REPORT_WAIT_S)
             if first and first[0] >= self._earliest:  # what was reckoned beyond it is wrong
                 found.append(first)
-        return Numbered(*min(found), 0) if found else None
+        if not found:
+            return None
+        latest = min(found)
+        return Numbered(*(self._by_clock_before(held[0], latest[0]) or latest), 0)
+
+    def _by_clock_before(self, first: Grab, latest_index: int) -> tuple[int, int] | None:
+        """The trigger of ``first``, not above ``latest_index``, by the clock of before; None when it has not run on."""
+        if self._before is None:
+            return None
+        grab, numbered = self._before
+        passed_ns = self._device_ns(first.device_ticks - grab.device_ticks)
+        if not 0 < passed_ns < KNOWN_FOR_NS:
+            return None
+        expected_ns = numbered.trigger_ns + passed_ns
+        found = self._triggers.nearest(expected_ns, FIRST_REPORT_WAIT_S)
+        if found is None or abs(found[1] - expected_ns) > passed_ns * CLOCK_ERROR + EDGE_ERROR_NS:
+            return None
+        lowest = max(self._earliest, latest_index - LATEST_TRIGGERS)
+        return found if lowest <= found[0] <= latest_index else None
 
     def _next(self, grab: Grab, last: tuple[Grab, Numbered]) -> Numbered | None:
         last_grab, before = last

@@ -85,6 +85,34 @@ def test_a_clock_that_jumps_costs_a_few_frames_and_no_wrong_one():
     assert numbers == [(k, None if 10 <= k < 10 + CONFIRMING else k) for k in range(40)]
 
 
+@pytest.mark.parametrize(
+    ("ticks_at_return", "late_ns"),
+    [
+        (0, 45_000_000),  # its clock ran on: every frame may be late
+        (-(10**12), 1_000_000),  # powered anew: as at the start, one of the first must be in time
+        (3 * PERIOD_NS + 7_000_000, 1_000_000),  # set anew to nearly what it was
+    ],
+)
+def test_a_camera_that_comes_back_is_known_by_its_clock_if_that_ran_on(ticks_at_return, late_ns):
+    log, told = TriggerLog(25), []
+    for index in range(120):
+        log.add(Pulse(index, index, START_NS + index * PERIOD_NS, START_NS + index * PERIOD_NS))
+
+    def frame(k: int, more_ticks: int, late_ns: int) -> Grab:
+        receive_ns = START_NS + k * PERIOD_NS + EXPOSURE_US * 1000 + ROW_NS * HEIGHT + late_ns
+        ticks = 10**13 + round(k * PERIOD_NS * (1 + 80e-6)) + more_ticks
+        return Grab(0, k, ticks, receive_ns, EXPOSURE_US, 0.0, FrameStatus.COMPLETE)
+
+    first = FrameNumbering(CAMERA, log)
+    for k in range(10):
+        first.feed(frame(k, 0, 1_000_000))
+    absent = FrameNumbering(CAMERA, log, 10, first.last)  # it came, and went before it gave a frame
+    back = FrameNumbering(CAMERA, log, 60, absent.last)
+    for k in range(80, 100):
+        told += back.feed(frame(k, ticks_at_return, late_ns if k < 90 else 1_000_000))
+    assert [numbered.index for _, numbered in told] == list(range(80, 100))
+
+
 def test_no_frame_is_of_a_trigger_before_the_first():
     """The board pauses and its last report is late: reckoned by the period, the first frame would be of trigger 6."""
     edges = [START_NS + k * PERIOD_NS for k in (0, 1, 2)] + [START_NS + round(4.6 * PERIOD_NS)]
