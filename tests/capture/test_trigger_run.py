@@ -166,6 +166,10 @@ def test_a_step_of_the_boards_clock_moves_no_frame_to_another_trigger(flight, pi
 
 
 def test_a_board_of_1970_is_marked_and_recorded_by_the_computers_time(flight, pixels_of):
+    """A line that this computer reads late misleads nobody, if by less than exposure and read-out (18 ms)."""
+    text = flight.config.read_text(encoding="utf-8")
+    assert "exposure_us = 1000\n" in text
+    flight.config.write_text(text.replace("exposure_us = 1000\n", "exposure_us = 15000\n"), encoding="utf-8")
     flight.faults.strange_clock = {0: -time.time_ns()}
     result = flight.fly()
     assert (result.triggers, result.lost, result.failures) == (TRIGGERS, 0, [])
