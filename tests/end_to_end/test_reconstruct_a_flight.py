@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from needs import needs_module
+from pandas.testing import assert_frame_equal
 from rendered_flight import true_rig, write_flight
 
 from hw_sim.demo import executable
@@ -65,7 +66,9 @@ def alone(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def assert_same_tables(one: Path, other: Path) -> None:
     for name in TABLES:
-        assert pq.read_table(one / f"{name}.parquet").equals(pq.read_table(other / f"{name}.parquet")), name
+        mine, others = (pq.read_table(folder / f"{name}.parquet") for folder in (one, other))
+        assert mine.schema.equals(others.schema), name
+        assert_frame_equal(mine.to_pandas(), others.to_pandas(), check_exact=True, obj=name)  # NaN is NaN
 
 
 def assert_same_bytes(one: Path, other: Path) -> None:
