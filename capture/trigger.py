@@ -3,6 +3,7 @@
 import bisect
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -27,8 +28,31 @@ REPLY_TIMEOUT_S = 1.0
 RECONNECT_S = 0.25
 WRITE_TIMEOUT_S = 1.0
 BOARD_ANSWER_S = 2 * (WRITE_TIMEOUT_S + REPLY_TIMEOUT_S)  # a question is asked twice
+REPORTS_COMPARED = 64  # to find the delay that the computer did not add to
 _PULSES_KEPT = 4096
 _STEPS_KEPT = 64
+
+
+class ForeignClock:
+    """UTC of the pulses of a board whose clock is not on UTC: its clock, and the least delay of its last reports.
+
+    A report is late by what line and computer take, often much, but never early.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._last: Pulse | None = None
+        self._offsets_ns: deque[int] = deque(maxlen=REPORTS_COMPARED)
+
+    def utc_ns(self, pulse: Pulse, received_ns: int) -> int:
+        """When the pulse was given, by this computer's clock; begun with anew where pulse or clock has stepped."""
+        if self._last is not None:
+            regular_ns = (pulse.index - self._last.index) * self._period_ns
+            if abs(pulse.actual_ns - self._last.actual_ns - regular_ns) > 0.4 * self._period_ns:
+                self._offsets_ns.clear()
+        self._last = pulse
+        self._offsets_ns.append(received_ns - pulse.actual_ns)
+        return pulse.actual_ns + min(self._offsets_ns)
 
 
 class TriggerLog:
@@ -55,7 +79,7 @@ class TriggerLog:
 
         Args:
             pulse: its ``actual_ns`` is the time to be told to others.
-            trusted: False: it is not the board's own, but when its report came.
+            trusted: False: it is not the board's own, but reckoned from when its reports came.
             step_ns: what the time has stepped by since the pulse before.
 
         Returns:
@@ -75,6 +99,7 @@ class TriggerLog:
             self._times_ns.insert(at, time_ns)
             if not trusted:
                 self._untrusted.add(pulse.index)
+                self._lower_before(at)
             if len(self._indices) > 2 * _PULSES_KEPT:
                 del self._indices[:_PULSES_KEPT], self._times_ns[:_PULSES_KEPT]
                 self._untrusted = {index for index in self._untrusted if index >= self._indices[0]}
@@ -128,6 +153,14 @@ class TriggerLog:
 
     def _offset_ns(self, index: int) -> int:
         return next(offset_ns for since, offset_ns in reversed(self._steps) if since <= index or since == 0)
+
+    def _lower_before(self, at: int) -> None:
+        """A pulse's report shows that those before it, known by nothing but their reports, were reported later."""
+        for k in range(at - 1, max(-1, at - 1 - REPORTS_COMPARED), -1):
+            latest_ns = self._times_ns[at] - (self._indices[at] - self._indices[k]) * self.period_ns
+            if self._indices[k] not in self._untrusted or self._times_ns[k] <= latest_ns:
+                return
+            self._times_ns[k] = latest_ns
 
     def _reported_until(self, time_ns: int) -> bool:
         return bool(self._times_ns) and self._times_ns[-1] > time_ns - self.period_ns // 2

@@ -16,7 +16,7 @@ from capture.errors import TriggerBoardError
 from capture.gates import Gates
 from capture.ledger import Ledger
 from capture.record import Trigger
-from capture.trigger import BoardCount, TriggerBoard, TriggerLog
+from capture.trigger import BoardCount, ForeignClock, TriggerBoard, TriggerLog
 from capture.trigger_protocol import Pulse, Sample
 
 SILENT_S = 2.0  # a running board that has reported no pulse for so long is asked
@@ -25,6 +25,7 @@ DRAIN_S = 0.2  # how long frames of a reset board's last pulses may be on their 
 STRANGE_NS = 1_000_000_000  # a board whose clock is further from the computer's is not on its time
 GATE = "trigger board"
 LATE_KEPT = 64
+LATE_KNOWN = 8  # reports among which one can be taken to have come without delay
 STRAYS_KEPT = 256
 _SEEN_KEPT = 4096
 
@@ -87,6 +88,7 @@ class TriggerRun:
         self._gates = gates
         self._on_restart = on_restart
         self.board = TriggerBoard(config.port, clock, self._on_pulse, on_sample)
+        self._foreign = ForeignClock(triggers.period_ns)
         self._epoch: _Epoch | None = None
         self._count, self._begun = 0, False
         self._last: _Report | None = None
@@ -230,7 +232,7 @@ class TriggerRun:
             return
         now_s = self._clock.monotonic_s()
         trusted = abs(pulse.actual_ns - trigger.receive_time_ns) < STRANGE_NS
-        time_ns = pulse.actual_ns if trusted else trigger.receive_time_ns
+        time_ns = pulse.actual_ns if trusted else self._foreign.utc_ns(pulse, trigger.receive_time_ns)
         index = self._believed(pulse, epoch, time_ns)
         if index is None:
             self.unbelieved += 1
@@ -273,18 +275,20 @@ class TriggerRun:
 
         A stalled board's pulses come later than their period says, and are reported later too. A clock that steps on
         says they come later, and yet they are reported before that; one that steps back, the opposite. A report is
-        late by what line and computer take, often much, but never early: so it is the earliest ones that count.
+        late by what line and computer take, often much, but never early: so it is the earliest ones that count, and
+        of the first few all may have been late.
         """
         late_ns = round(now_s * 1e9) - time_ns  # by a clock that never steps, from any zero
-        last, floor_ns = self._last, min(self._late_ns, default=late_ns)
+        last, known, floor_ns = self._last, len(self._late_ns), min(self._late_ns, default=late_ns)
         self._late_ns.append(late_ns)
         if last is None or index <= last.index or self._fresh_epoch:
             return 0
         off_ns = time_ns - last.time_ns - (index - last.index) * self._triggers.period_ns
         much_ns = 0.4 * self._triggers.period_ns
-        stepped = (
-            late_ns < floor_ns - much_ns if off_ns > much_ns else off_ns < -much_ns and late_ns > floor_ns + much_ns
-        )
+        if off_ns > 0:
+            stepped = off_ns > much_ns and late_ns < floor_ns - much_ns and known >= LATE_KNOWN
+        else:
+            stepped = off_ns < -much_ns and late_ns > floor_ns + much_ns
         if not stepped:
             return 0
         self._late_ns.clear()
