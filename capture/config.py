@@ -283,7 +283,7 @@ GOOD_EXPOSURE_US = (1000, 5000)
 
 DRIVER_BUFFERS = 10
 """Buffers that a driver is given at least, so that a full ring is met by us, with a cause, and not by the driver. At
-the start some of them are held back until the first frames are numbered (capture.numbering.CONFIRMING)."""
+the start some of them are held back until the first frames are numbered (capture.numbering.MOST_HELD)."""
 STARVED_S = 0.4
 """How long a busy machine may keep the read threads waiting before the driver has no buffer left."""
 

@@ -37,7 +37,11 @@ class Triggers(Protocol):
 
 
 CONFIRMING = 4
-"""Frames that must agree before the first one is believed to know its trigger."""
+"""Frames there must be before the first one is believed to know its trigger; and …"""
+MOST_HELD = 7
+"""… so many where no two of them came equally promptly: then all may have been late, and the next one less."""
+PROMPT_SHARE = 1 / 8
+"""Of the time between frames, by which those that came promptly differ."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,8 @@ class Numbered:
 class FrameNumbering:
     """Ties one camera's frames to triggers by counter and time together.
 
-    The first frames are held back until there are ``CONFIRMING`` of them. By host time each belongs to the last trigger
+    The first frames are held back until there are ``CONFIRMING`` of them, and more where they came by fits and starts:
+    the computer was busy just then. By host time each belongs to the last trigger
     before its exposure can have begun, or, when it was delivered late, to an earlier one; so the earliest of what
     they say about the first frame is believed. From then on the *device's* clock says how many periods have passed
     since the last frame (host time is late when the host is busy, the device's is not), and its frame counter says
@@ -97,7 +102,7 @@ class FrameNumbering:
                 self._last, self._before, self._strays = None, None, 0
             return [(grab, numbered)]
         self._held.append(grab)
-        return self._settle() if len(self._held) >= CONFIRMING else []
+        return self._settle() if self._enough() else []
 
     def flush(self) -> list[tuple[Grab, Numbered | None]]:
         """Number what is held back, because no more will come."""
@@ -105,6 +110,14 @@ class FrameNumbering:
         while self._held:
             told += self._settle()
         return told
+
+    def _enough(self) -> bool:
+        """Whether the held frames can be taken to have one among them that came without delay."""
+        if not CONFIRMING <= len(self._held) < MOST_HELD:
+            return len(self._held) >= MOST_HELD
+        between_ns = self._device_ns(self._held[-1].device_ticks - self._held[0].device_ticks) / (len(self._held) - 1)
+        late_ns = sorted(grab.receive_ns - self._device_ns(grab.device_ticks) for grab in self._held)
+        return late_ns[1] - late_ns[0] <= PROMPT_SHARE * between_ns
 
     def _settle(self) -> list[tuple[Grab, Numbered | None]]:
         """Number what is held back. When the first of it is none of a trigger's, only that one is told.

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from capture.config import Config
 from capture.lane import Lane
 from capture.ledger import CameraAccount, Place
-from capture.numbering import CONFIRMING, FIRST_REPORT_WAIT_S
+from capture.numbering import MOST_HELD, FIRST_REPORT_WAIT_S
 from capture.trigger import BOARD_ANSWER_S
 
 SIGN_PERIOD_S = 0.5
@@ -32,7 +32,7 @@ def watchdog_s(config: Config) -> float:
     thread waits for a board that answers at its last chance, and the cameras' first frames are held back until
     there are enough to be numbered. Or, before a recording: the test burst.
     """
-    held_back_s = (CONFIRMING + 1 + config.start.burst) / config.trigger.rate_hz + FIRST_REPORT_WAIT_S
+    held_back_s = (MOST_HELD + 1 + config.start.burst) / config.trigger.rate_hz + FIRST_REPORT_WAIT_S
     return max(LEAST_S, MARGIN * (config.ring.stall_s + BOARD_ANSWER_S + held_back_s + SIGN_PERIOD_S))
 
 

@@ -113,6 +113,20 @@ def test_a_camera_that_comes_back_is_known_by_its_clock_if_that_ran_on(ticks_at_
     assert [numbered.index for _, numbered in told] == list(range(80, 100))
 
 
+@pytest.mark.parametrize("late_ms", [(150, 110, 70, 45, 5, 4), (60, 90, 48, 71, 80, 55, 3), (210, 170, 130, 90, 50, 10)])
+def test_first_frames_that_come_by_fits_and_starts_are_waited_out(late_ms):
+    """The first four are all late by more than a period, as after a stall of the computer, or while it is busy."""
+    log, told = TriggerLog(25), []
+    for index in range(20):
+        log.add(Pulse(index, index, START_NS + index * PERIOD_NS, START_NS + index * PERIOD_NS))
+    numbering = FrameNumbering(CAMERA, log)
+    for k in range(20):
+        late_ns = (late_ms[k] if k < len(late_ms) else 2) * 1_000_000
+        receive_ns = START_NS + k * PERIOD_NS + EXPOSURE_US * 1000 + ROW_NS * HEIGHT + late_ns
+        told += numbering.feed(Grab(0, k, k * PERIOD_NS, receive_ns, EXPOSURE_US, 0.0, FrameStatus.COMPLETE))
+    assert [numbered.index for _, numbered in told] == list(range(20))
+
+
 def test_no_frame_is_of_a_trigger_before_the_first():
     """The board pauses and its last report is late: reckoned by the period, the first frame would be of trigger 6."""
     edges = [START_NS + k * PERIOD_NS for k in (0, 1, 2)] + [START_NS + round(4.6 * PERIOD_NS)]
