@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from capture.config import Config
 from capture.lane import Lane
 from capture.ledger import CameraAccount, Place
-from capture.numbering import MOST_HELD, FIRST_REPORT_WAIT_S
+from capture.numbering import FIRST_REPORT_WAIT_S, MOST_HELD
 from capture.trigger import BOARD_ANSWER_S
 
 SIGN_PERIOD_S = 0.5

@@ -113,7 +113,9 @@ def test_a_camera_that_comes_back_is_known_by_its_clock_if_that_ran_on(ticks_at_
     assert [numbered.index for _, numbered in told] == list(range(80, 100))
 
 
-@pytest.mark.parametrize("late_ms", [(150, 110, 70, 45, 5, 4), (60, 90, 48, 71, 80, 55, 3), (210, 170, 130, 90, 50, 10)])
+@pytest.mark.parametrize(
+    "late_ms", [(150, 110, 70, 45, 5, 4), (60, 90, 48, 71, 80, 55, 3), (210, 170, 130, 90, 50, 10)]
+)
 def test_first_frames_that_come_by_fits_and_starts_are_waited_out(late_ms):
     """The first four are all late by more than a period, as after a stall of the computer, or while it is busy."""
     log, told = TriggerLog(25), []

@@ -129,8 +129,8 @@ def test_the_period_outlasts_every_healthy_silence(rate_hz, stall_s):
             "cameras": places,
         }
     )
-    # The first frames are held back, four or up to seven, then the disk stalls, while the control thread waits for the board's answer
-    # (two questions, a second each to write and to be answered) and has just missed the last look.
+    # The first frames are held back, up to seven, then the disk stalls, while the control thread waits for the board's
+    # answer (two questions, a second each to write and to be answered) and has just missed the last look.
     silence_s = 7.0 / rate_hz + stall_s + 2 * (1.0 + 1.0) + 0.5
     assert watchdog_s(config) > 1.2 * silence_s
     assert watchdog_s(config) < 2.0 * (8.0 / rate_hz + stall_s + 6.0)
