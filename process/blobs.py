@@ -33,6 +33,7 @@ class Scene:
     """The image above its background."""
 
     image: Pixels
+    """once the lit groups are known, only what is around them need still be there"""
     smooth: Pixels | None
     """background (tiles down, tiles across) where it varies: light is counted from it; None: from 0"""
     floor: float

@@ -1,5 +1,6 @@
 """A frame to its light spots: sub-pixel centres with covariances, and what was turned down and why."""
 
+import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from process.blobs import Blobs, Rejected, Scene, find_blobs, lit_groups, scene_of
+from process.blobs import Blobs, Groups, Rejected, Scene, find_blobs, lit_groups, scene_of
 from process.spot_fit import (
     AMPLITUDE,
     BACKGROUND,
@@ -34,6 +35,7 @@ Pixels = NDArray[np.uint8]
 
 _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH = 4, 28  # of the round patches, pixels
 _RIM_PX = 3.0  # a patch reaches this far beyond the blob
+_memory = threading.local()
 _HOT_SIZE_PX = 0.5  # no lens draws a smaller spot
 
 
@@ -105,19 +107,49 @@ def detect(image: Pixels, settings: DetectSettings | None = None) -> Detections:
 def detect_all(images: Iterable[Pixels], settings: DetectSettings) -> list[Detections]:
     """``detect`` for several images, faster than one by one.
 
-    Each is taken when it is its turn to be looked through, and looked at again later.
+    Each is looked at when it is its turn, and not again: it need not be valid any longer than until the next.
     """
     if settings.method == "paper":
         return [_detect_paper(image, settings) for image in images]
     scenes, groups = [], []
-    for image in images:
-        scenes.append(scene_of(image, settings.contrast))
-        groups.append(lit_groups(scenes[-1]))
+    for number, image in enumerate(images):
+        scene = scene_of(image, settings.contrast)
+        lit = lit_groups(scene)
+        scene.image = _kept(image, lit, number)
+        scenes.append(scene)
+        groups.append(lit)
     if not scenes:
         return []
     blobs, counts = find_blobs(scenes, groups, settings.largest_radius_px, settings.least_roundness)
     sight = _sight(scenes, blobs, counts, settings)
     return _judged(sight, _fitted(sight, settings), settings)
+
+
+def _kept(image: Pixels, lit: Groups, number: int) -> Pixels:
+    """The pixels around lit groups, at their places in an image whose other pixels are anything.
+
+    Of this thread's memory: valid until the next that is kept as this ``number``.
+    """
+    if not lit.counts.size:
+        return image
+    canvases: list[Pixels] = vars(_memory).setdefault("canvases", [])
+    if number == len(canvases):
+        canvases.append(np.empty_like(image))
+    if canvases[number].shape != image.shape:
+        canvases[number] = np.empty_like(image)
+    canvas = canvases[number]
+    margin = _half_widths(lit.counts) + 1  # a blob has no more pixels than its group
+    low, high = (
+        np.stack([extreme.reduceat(places, lit.begins) for places in (lit.rows, lit.columns)])
+        for extreme in (np.minimum, np.maximum)
+    )
+    low, high = np.maximum(low - margin, 0), high + margin + 1
+    if np.prod(high - low, axis=0).sum() > image.size:
+        canvas[:] = image
+        return canvas
+    for top, left, bottom, right in zip(*low.tolist(), *high.tolist(), strict=True):
+        canvas[top:bottom, left:right] = image[top:bottom, left:right]
+    return canvas
 
 
 @dataclass(eq=False)
@@ -143,9 +175,7 @@ class _Sight:
 
 
 def _sight(scenes: Sequence[Scene], blobs: Blobs, counts: NDArray[np.intp], settings: DetectSettings) -> _Sight:
-    half_widths = np.clip(
-        np.ceil(np.sqrt(blobs.area_px / np.pi) + _RIM_PX), _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH
-    ).astype(np.intp)
+    half_widths = _half_widths(blobs.area_px)
     parts = [slice(begin, end) for begin, end in pairwise([0, *np.cumsum(counts).tolist()])]
     start = np.zeros((len(blobs), PARAMETERS))
     start[:, U], start[:, V] = blobs.u_px, blobs.v_px
@@ -155,6 +185,12 @@ def _sight(scenes: Sequence[Scene], blobs: Blobs, counts: NDArray[np.intp], sett
         start[part, BACKGROUND] = scene.background(rows[part], columns[part])
     patches, apart = _patches(scenes, parts, start[:, :2], half_widths, settings)
     return _Sight(scenes, parts, blobs, start, half_widths, patches, apart)
+
+
+def _half_widths(area_px: Array | NDArray[np.intp]) -> NDArray[np.intp]:
+    """(N,) of the patches about spots of N areas, pixels."""
+    wide = np.ceil(np.sqrt(area_px / np.pi) + _RIM_PX)
+    return np.clip(wide, _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH).astype(np.intp)
 
 
 def _fitted(sight: _Sight, settings: DetectSettings) -> Fit:

@@ -4,13 +4,11 @@ The work is cut at every 50th trigger of each side, and matching starts afresh a
 depend on how many processes made it.
 """
 
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 
 import pyarrow as pa
@@ -22,15 +20,15 @@ from process.flight_cameras import check_cameras
 from process.fuselage_lights import LIGHTS_SCHEMA, light_spots, lights_table
 from process.marker_rows import SeenSet, marker_rows
 from process.match import MatchSettings, Track, match_sighting, sightings
-from process.recording import FrameSet, FrameSetReader, Recording, SetPlaces, open_recording
+from process.read_ahead import loaded
+from process.recording import FrameSet, Recording, SetPlaces, open_recording
 from process.set_time import set_instant_ns
 from process.triangulate import Method
 from process.workers import Shared, crew, usable_cores
 
 BLOCK_TRIGGERS = 50
-GROUP_SETS = 5  # measured together: reads are large, and what a call costs is shared
+GROUP_SETS = 5  # measured together: what a call costs is shared
 BLOCKS_WORTH_A_PROCESS = 4  # starting one costs as much as processing a block or two
-_kept = threading.local()
 Progress = Callable[[int, int], None]
 
 
@@ -160,38 +158,15 @@ def measure_block(job: BlockJob) -> BlockResult:
     rig, settings = job.how.get()
     problems: list[str] = []
     sets = []
-    for frame_sets in _loaded(job.block.places):
-        sets += _detected(frame_sets, problems, rig, settings.detection)
+    frame_sets = loaded(job.block.places)
+    for _ in range(0, len(job.block.places), GROUP_SETS):
+        sets += _detected(islice(frame_sets, GROUP_SETS), problems, rig, settings.detection)
     seen, rejected = _seen(job.block.side, sets, rig, settings)
     side = rig.side(job.block.side)
     table = marker_rows(seen, side, rig.markers, settings.matching, settings.triangulation)
     lit = [(one.frames.trigger_index, set_instant_ns(one.frames, side), one.lights) for one in seen if one.lights]
     lights = lights_table(job.block.side, side, lit if side.references else ())
     return BlockResult(table, len(job.block.places), tuple(problems), dict(rejected), lights)
-
-
-def _loaded(places: Sequence[SetPlaces]) -> Iterator[Iterator[FrameSet]]:
-    """The frame sets, GROUP_SETS at a time, valid until the next; the next ones' bytes are on their way meanwhile.
-
-    Each is checked only when it is its turn: what has just been read through is still in the processor's cache.
-    """
-    groups = [places[begin : begin + GROUP_SETS] for begin in range(0, len(places), GROUP_SETS)]
-    with _reader("even") as one, _reader("odd") as other, ThreadPoolExecutor(1, "read-ahead") as ahead:
-        waiting = ahead.submit(one.load, groups[0])
-        for number, group in enumerate(groups):
-            reader, following = (one, other) if number % 2 == 0 else (other, one)
-            waiting.result()
-            if number + 1 < len(groups):
-                waiting = ahead.submit(following.load, groups[number + 1])
-            yield map(reader.read, group)
-
-
-def _reader(name: str) -> FrameSetReader:
-    """A reader of this thread's, whose memory all its blocks use in turn: new memory costs as much as reading it."""
-    if not hasattr(_kept, name):
-        setattr(_kept, name, FrameSetReader())
-    reader: FrameSetReader = getattr(_kept, name)
-    return reader
 
 
 def _detected(

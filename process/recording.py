@@ -17,7 +17,6 @@ from process.mcap_file import BadChunk, ChunkReader, MessageHead, Place, index_f
 
 Pixels = NDArray[np.uint8]
 SAMPLE_BYTES = 1e9
-SAMPLE_SETS = 5
 INDEXED_AT_ONCE = 4  # files
 SEARCH_DEPTH = 2  # folders below the one named
 
@@ -82,7 +81,11 @@ class FrameSetReader:
 
     def load(self, sets: Sequence[SetPlaces]) -> None:
         """Read the bytes of several sets at once; images of the sets loaded before are no longer valid."""
-        self._reader.load(place for one in sets for place in (*one.images, *one.frames) if place is not None)
+        self._reader.load(_places(sets))
+
+    def cached(self, sets: Sequence[SetPlaces]) -> bool:
+        """Whether loading several sets need not wait for the disk."""
+        return self._reader.cached(_places(sets))
 
     def read(self, places: SetPlaces) -> FrameSet:
         """The frame set; a frame that fails its CRC is None, and told in ``problems``.
@@ -168,15 +171,14 @@ def reading_s(recording: Recording, threads: int) -> float:
     Scaled up from SAMPLE_BYTES spread over it; as they are now, in the page cache or not.
     """
     sets = [places for own in recording.sides.values() for places in own]
-    groups = [sets[at : at + SAMPLE_SETS] for at in range(0, len(sets), SAMPLE_SETS)]
-    sizes = [sum(place.chunk_size for one in group for place in one.images if place is not None) for group in groups]
-    wanted = max(threads, round(len(groups) * min(1.0, SAMPLE_BYTES / max(1, sum(sizes)))))
-    picked = np.unique(np.linspace(0, len(groups) - 1, wanted).round().astype(int)).tolist()
+    sizes = [sum(place.chunk_size for place in one.images if place is not None) for one in sets]
+    wanted = max(threads, round(len(sets) * min(1.0, SAMPLE_BYTES / max(1, sum(sizes)))))
+    picked = np.unique(np.linspace(0, len(sets) - 1, wanted).round().astype(int)).tolist()
 
     def read(share: list[int]) -> None:
         with FrameSetReader() as reader:
             for number in share:
-                reader.load(groups[number])
+                reader.load([sets[number]])
 
     began = time.monotonic()
     with ThreadPoolExecutor(threads) as pool:
@@ -213,6 +215,10 @@ class _CameraPlaces:
 
 
 _Numbered = dict[int, tuple[Place, Place | None]]
+
+
+def _places(sets: Sequence[SetPlaces]) -> Iterator[Place]:
+    return (place for one in sets for place in (*one.images, *one.frames) if place is not None)
 
 
 def _read_image(reader: ChunkReader, place: Place) -> tuple[Pixels, int]:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
@@ -117,9 +118,8 @@ class TableWriter:
     def _flush(self) -> None:
         if self._waiting:
             table = pa.concat_tables(self._waiting)
-            with self._errors():
-                for writer in self._writers:
-                    writer.write_table(table)
+            with self._errors(), ThreadPoolExecutor(len(self._writers), "table") as threads:
+                list(threads.map(lambda writer: writer.write_table(table), self._writers))
         self._waiting, self._rows = [], 0
 
     @contextmanager

@@ -20,6 +20,7 @@ from threading import BrokenBarrierError
 from typing import Any, Generic, Protocol, TypeVar
 
 import cv2
+import pyarrow as pa
 
 from capture.errors import ProcessError, UsageError
 
@@ -106,6 +107,16 @@ def crew(workers: int, scheduler: str | None = None, modules: tuple[str, ...] = 
         UsageError: there is no Dask, or none answers at that address.
         ProcessError: the processes do not start.
     """
+    gc.freeze()  # what is loaded stays: looking it through again and again would hold everybody up
+    try:
+        with _crew(workers, scheduler, modules) as hands:
+            yield hands
+    finally:
+        gc.unfreeze()
+
+
+@contextmanager
+def _crew(workers: int, scheduler: str | None, modules: tuple[str, ...]) -> Iterator[Crew]:
     if scheduler is not None:
         with _dask(workers, scheduler, modules) as cluster:
             yield cluster
@@ -263,7 +274,7 @@ def _start(ready: Any, modules: tuple[str, ...]) -> None:
     threading.Thread(target=_end_with_parent, name="end-with-parent", daemon=True).start()
     cv2.setNumThreads(1)
     _load(modules)
-    gc.freeze()  # what is loaded stays: it need not be looked through again and again
+    gc.freeze()  # as in the parent
     ready.wait(START_S)
 
 
@@ -277,6 +288,7 @@ def _end_with_parent() -> None:
 def _load(modules: tuple[str, ...]) -> None:
     for name in modules:
         import_module(name)
+    pa.array([""])  # Arrow looks for pandas when it makes its first array, and that takes a while
 
 
 def _nothing() -> None:

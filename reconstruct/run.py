@@ -21,6 +21,7 @@ from process.json_file import provenance, write_json
 from process.memory import MemoryWatch
 from process.parts import PartStore
 from process.pipeline import PipelineSettings
+from process.read_ahead import READS_AHEAD
 from process.recording import Recording, find_files, open_recording, reading_s
 from process.reference import Window
 from process.shared_error import layout_of, sides_of, with_rig
@@ -283,7 +284,7 @@ class _Source:
         """How long reading the frames takes by itself; None when there were none, or others read them."""
         if self._recording is None or self._job.scheduler is not None:
             return None
-        return reading_s(self._recording, usable_cores())
+        return reading_s(self._recording, usable_cores() * READS_AHEAD)
 
     def note(self, plan: FitPlan) -> dict[str, Any]:
         """How a result of it is made: all that the result depends on."""

@@ -9,7 +9,7 @@ from hw_sim.render import render_frame
 from hw_sim.spots import led_spots
 from hw_sim.wing_motion import LedMotion
 from hw_sim.world import World
-from process.detect import DetectSettings, detect
+from process.detect import DetectSettings, detect, detect_all
 
 READ_SIGMA, SHOT_GAIN, AMPLITUDE = 1.5, 0.04, 157.0
 
@@ -198,6 +198,36 @@ def test_rows_that_are_not_contiguous(painter):
     image = np.zeros((64, 80), np.uint8)
     image[:, :64] = canvas.image()
     np.testing.assert_allclose(detect(image[:, :64]).pixels, [[30, 31]], atol=0.05)
+
+
+def test_an_image_need_not_outlive_its_turn(painter):
+    """All in one memory, each overwritten by the next: pairs, hot pixels, large ones, and lights at the border."""
+    images = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        canvas = painter(400, 500, seed)
+        for u, v, radius in rng.uniform((-5, -5, 0.3), (505, 405, 9.0), (30, 3)):
+            canvas.add(u, v, radius, 0.8, rng.uniform(60, 400))
+        if seed % 2:
+            canvas.clean += np.linspace(0, 110, 500)[None, :]
+        image = canvas.image(read_sigma=READ_SIGMA)
+        image[rng.integers(0, 400, 5), rng.integers(0, 500, 5)] = 255
+        images.append(image)
+    memory = np.empty_like(images[0])
+
+    def given():
+        for image in images:
+            memory[:] = image
+            yield memory
+            memory[:] = 255
+
+    found = detect_all(given(), DetectSettings())
+    for one, image in zip(found, images, strict=True):
+        alone = detect(image)
+        assert len(alone) > 5
+        assert one.rejected == alone.rejected
+        np.testing.assert_array_equal(one.pixels, alone.pixels)
+        np.testing.assert_array_equal(one.covariance_px2, alone.covariance_px2)
 
 
 def test_opencv_agrees_on_the_pixel_origin(painter):

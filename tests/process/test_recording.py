@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Header, Message, Schema
@@ -127,6 +129,49 @@ def test_every_cut_gives_a_result_or_a_reason(tmp_path, recording_writer):
             open_recording([path])
         except ProcessError as error:
             assert str(path) in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize("with_crc", [True, False])
+@given(data=st.data())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
+def test_a_damaged_summary_is_not_believed(tmp_path, recording_writer, with_crc, data):
+    """Its CRC tells, or, where the writer gave none, what follows from it is checked: no error, no other frame."""
+    path = tmp_path / f"left_{with_crc}.mcap"
+    if not path.exists():
+        writer = recording_writer(path)
+        write_side(writer, "left", range(6))
+        writer.close()
+    whole = path.read_bytes()
+    summary_at = int.from_bytes(whole[-28:-20], "little")
+    damaged = bytearray(whole)
+    if not with_crc:
+        damaged[-12:-8] = bytes(4)
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(summary_at, len(whole) - 1))] = data.draw(st.integers(0, 255))
+    other = tmp_path / "left_0000.mcap"
+    other.write_bytes(damaged)
+    path.write_bytes(whole)
+    index, truth = index_file(other), index_file(path)
+    assert truth.problems == []
+    places = {(head.sequence, head.place.chunk_at, head.place.at) for head in truth.messages}
+    found = {(head.sequence, head.place.chunk_at, head.place.at) for head in index.messages}
+    assert found <= places
+    if with_crc:
+        assert found == places
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD])
+def test_chunks_are_where_the_stock_reader_finds_them(tmp_path, recording_writer, compression):
+    path = tmp_path / "left_0000.mcap"
+    writer = recording_writer(path, compression=compression, chunk_size=3000)
+    write_side(writer, "left", range(50))
+    writer.close()
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    index = index_file(path)
+    assert index.problems == []
+    found = {(head.place.chunk_at, head.place.chunk_size) for head in index.messages}
+    assert found == {(chunk.chunk_start_offset, chunk.chunk_length) for chunk in chunks}
 
 
 def test_zeros_after_the_last_chunk_end_the_file(tmp_path, recording_writer):
