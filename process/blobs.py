@@ -269,19 +269,21 @@ def _lit_before(scene: Scene, smooth: Pixels) -> tuple[Indices, Indices]:
     half = _TILE // 2  # wide: the bytes of a word
     brightest = _brightest(scene.image)
     least = cv2.erode(smooth, np.ones((3, 3), np.uint8))  # between samples it is nowhere less than the least around
-    down, across = (
-        np.minimum(np.arange(size) // tile, samples - 1)
-        for size, tile, samples in zip(brightest.shape, (1, _TILE), least.shape, strict=True)
-    )
-    brightest = cv2.subtract(brightest, np.ascontiguousarray(least[down][:, across]))
-    bright = (brightest > int(scene.threshold)).view(np.uint64) != 0
+    tiles, columns = brightest.shape
+    least = least[np.minimum(np.arange(tiles), len(least) - 1)]  # a last tile that is cut has no sample of its own
+    least = np.pad(least, ((0, 0), (0, max(0, -(-columns // _TILE) - least.shape[1]))), "edge")
+    least = cv2.resize(least, (least.shape[1] * _TILE, tiles), interpolation=cv2.INTER_NEAREST)[:, :columns]
+    bright = (cv2.subtract(brightest, least) > int(scene.threshold)).view(np.uint64) != 0
     row, column = np.divmod(np.flatnonzero(bright), bright.shape[1])
     rows, columns = row[:, None] * _TILE + np.arange(_TILE), column[:, None] * half + np.arange(half)
-    inside = np.minimum(rows, height - 1)[:, :, None], np.minimum(columns, width - 1)[:, None, :]
-    there = scene.light(*inside) > int(scene.threshold)
+    grey = scene.image[np.minimum(rows, height - 1)[:, :, None], np.minimum(columns, width - 1)[:, None, :]]
+    lowest = least[row, column * half].astype(np.intp) + int(scene.threshold)
+    there = grey > lowest[:, None, None]
     there &= (rows < height)[:, :, None] & (columns < width)[:, None, :]
     tile, down, across = np.nonzero(there)
-    return rows[tile, down], columns[tile, across]
+    rows, columns = rows[tile, down], columns[tile, across]
+    lit = scene.light(rows, columns) > int(scene.threshold)
+    return rows[lit], columns[lit]
 
 
 def _brightest(image: Pixels) -> Pixels:

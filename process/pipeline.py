@@ -27,7 +27,7 @@ from process.triangulate import Method
 from process.workers import Shared, crew, usable_cores
 
 BLOCK_TRIGGERS = 50
-GROUP_SETS = 5  # measured together: what a call costs is shared
+GROUP_SETS = 10  # measured together: what a call costs is shared
 BLOCKS_WORTH_A_PROCESS = 4  # starting one costs as much as processing a block or two
 Progress = Callable[[int, int], None]
 
