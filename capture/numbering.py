@@ -7,7 +7,7 @@ from capture.camera.base import CameraDescription, Grab
 
 REPORT_WAIT_S = 0.03
 """How long a frame waits for the board's report of its trigger; the report normally came long before."""
-FIRST_REPORT_WAIT_S = 0.2
+FIRST_REPORT_WAIT_S = 0.12
 """The same for a camera's first frame, which nothing but the report can number. The driver's buffers bridge it."""
 
 

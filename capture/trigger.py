@@ -36,23 +36,36 @@ _STEPS_KEPT = 64
 class ForeignClock:
     """UTC of the pulses of a board whose clock is not on UTC: its clock, and the least delay of its last reports.
 
-    A report is late by what line and computer take, often much, but never early.
+    A report is late by what line and computer take, often much, but never early. A step of the board's clock by less
+    than 0.4 periods is not noticed: for ``REPORTS_COMPARED`` reports, times may then be early by as much.
     """
 
     def __init__(self, period_ns: int) -> None:
+        self.since_index = 0  # of the pulses whose times rest on the same clocks as the last one's
         self._period_ns = period_ns
-        self._last: Pulse | None = None
+        self._last: tuple[Pulse, int] | None = None  # and UTC minus a clock that never steps
         self._offsets_ns: deque[int] = deque(maxlen=REPORTS_COMPARED)
 
-    def utc_ns(self, pulse: Pulse, received_ns: int) -> int:
-        """When the pulse was given, by this computer's clock; begun with anew where pulse or clock has stepped."""
-        if self._last is not None:
-            regular_ns = (pulse.index - self._last.index) * self._period_ns
-            if abs(pulse.actual_ns - self._last.actual_ns - regular_ns) > 0.4 * self._period_ns:
-                self._offsets_ns.clear()
-        self._last = pulse
-        self._offsets_ns.append(received_ns - pulse.actual_ns)
-        return pulse.actual_ns + min(self._offsets_ns)
+    def utc_ns(self, pulse: Pulse, received_ns: int, monotonic_ns: int) -> tuple[int, int]:
+        """When the pulse was given, by this computer's clock; begun with anew where a pulse or a clock has stepped.
+
+        Returns:
+            that time, and by how much later than true those told since ``since_index`` were, as is seen now.
+        """
+        if self._last is None or self._has_stepped(*self._last, pulse, received_ns - monotonic_ns):
+            self._offsets_ns.clear()
+            self.since_index = pulse.index
+        self._last = pulse, received_ns - monotonic_ns
+        offset_ns = received_ns - pulse.actual_ns
+        before_ns = min(self._offsets_ns, default=offset_ns)
+        self._offsets_ns.append(offset_ns)
+        return pulse.actual_ns + min(self._offsets_ns), max(0, before_ns - offset_ns)
+
+    def _has_stepped(self, last: Pulse, utc_ns: int, pulse: Pulse, now_utc_ns: int) -> bool:
+        """Whether the board's pulse or clock has, or the computer's clock."""
+        regular_ns = (pulse.index - last.index) * self._period_ns
+        board_ns = pulse.actual_ns - last.actual_ns - regular_ns
+        return abs(board_ns) > 0.4 * self._period_ns or abs(now_utc_ns - utc_ns) > self._period_ns / 4
 
 
 class TriggerLog:
@@ -99,13 +112,20 @@ class TriggerLog:
             self._times_ns.insert(at, time_ns)
             if not trusted:
                 self._untrusted.add(pulse.index)
-                self._lower_before(at)
             if len(self._indices) > 2 * _PULSES_KEPT:
                 del self._indices[:_PULSES_KEPT], self._times_ns[:_PULSES_KEPT]
                 self._untrusted = {index for index in self._untrusted if index >= self._indices[0]}
             self._silent = False
             self._changed.notify_all()
             return True
+
+    def lower(self, since_index: int, late_ns: int) -> None:
+        """Pulses from an index on, known by nothing but their reports, were told so much too late."""
+        with self._changed:
+            for k in range(len(self._indices) - 1, -1, -1):
+                if self._indices[k] < since_index or self._indices[k] not in self._untrusted:
+                    break
+                self._times_ns[k] -= late_ns
 
     def nearest(self, time_ns: int, wait_s: float) -> tuple[int, int] | None:
         """Index and time of the trigger nearest to ``time_ns``, both in this log's time.
@@ -148,19 +168,12 @@ class TriggerLog:
         with self._changed:
             k = bisect.bisect_left(self._indices, index)
             known = k < len(self._indices) and self._indices[k] == index
-            untrusted = index in self._untrusted
+            nearest = index if known else self._indices[max(0, k - 1)] if self._indices else index
+            untrusted = nearest in self._untrusted
             return log_ns + self._offset_ns(index) + untrusted * self._report_ns, known and not untrusted
 
     def _offset_ns(self, index: int) -> int:
         return next(offset_ns for since, offset_ns in reversed(self._steps) if since <= index or since == 0)
-
-    def _lower_before(self, at: int) -> None:
-        """A pulse's report shows that those before it, known by nothing but their reports, were reported later."""
-        for k in range(at - 1, max(-1, at - 1 - REPORTS_COMPARED), -1):
-            latest_ns = self._times_ns[at] - (self._indices[at] - self._indices[k]) * self.period_ns
-            if self._indices[k] not in self._untrusted or self._times_ns[k] <= latest_ns:
-                return
-            self._times_ns[k] = latest_ns
 
     def _reported_until(self, time_ns: int) -> bool:
         return bool(self._times_ns) and self._times_ns[-1] > time_ns - self.period_ns // 2

@@ -232,7 +232,9 @@ class TriggerRun:
             return
         now_s = self._clock.monotonic_s()
         trusted = abs(pulse.actual_ns - trigger.receive_time_ns) < STRANGE_NS
-        time_ns = pulse.actual_ns if trusted else self._foreign.utc_ns(pulse, trigger.receive_time_ns)
+        time_ns, late_ns = pulse.actual_ns, 0
+        if not trusted:
+            time_ns, late_ns = self._foreign.utc_ns(pulse, trigger.receive_time_ns, round(now_s * 1e9))
         index = self._believed(pulse, epoch, time_ns)
         if index is None:
             self.unbelieved += 1
@@ -245,6 +247,8 @@ class TriggerRun:
         strange = f"its clock is {(pulse.actual_ns - trigger.receive_time_ns) / 1e9:.0f} s off this computer's"
         self._gates.judge("trigger board clock", None if trusted else strange)
         self._see(index)
+        if late_ns:
+            self._triggers.lower(self._foreign.since_index, late_ns)
         step_ns = self._step_ns(index, time_ns, now_s)
         self._triggers.add(replace(pulse, index=index, actual_ns=time_ns), trusted, step_ns)
         self._ledger.triggered(index + 1)
@@ -275,8 +279,8 @@ class TriggerRun:
 
         A stalled board's pulses come later than their period says, and are reported later too. A clock that steps on
         says they come later, and yet they are reported before that; one that steps back, the opposite. A report is
-        late by what line and computer take, often much, but never early: so it is the earliest ones that count, and
-        of the first few all may have been late.
+        late by what line and computer take, often much, but never early: so it is the earliest ones that count. Of the
+        first few all may have been late: then a step must be what the report came earlier by.
         """
         late_ns = round(now_s * 1e9) - time_ns  # by a clock that never steps, from any zero
         last, known, floor_ns = self._last, len(self._late_ns), min(self._late_ns, default=late_ns)
@@ -285,11 +289,13 @@ class TriggerRun:
             return 0
         off_ns = time_ns - last.time_ns - (index - last.index) * self._triggers.period_ns
         much_ns = 0.4 * self._triggers.period_ns
+        earlier_ns = floor_ns - late_ns
         if off_ns > 0:
-            stepped = off_ns > much_ns and late_ns < floor_ns - much_ns and known >= LATE_KNOWN
+            told = known >= LATE_KNOWN or abs(earlier_ns - off_ns) < 0.1 * self._triggers.period_ns
+            stepped = off_ns > much_ns and earlier_ns > much_ns and told
         else:
-            stepped = off_ns < -much_ns and late_ns > floor_ns + much_ns
+            stepped = off_ns < -much_ns and earlier_ns < -much_ns
         if not stepped:
             return 0
-        self._late_ns.clear()
+        self._late_ns = deque((*(one_ns - off_ns for one_ns in [*self._late_ns][:-1]), late_ns), LATE_KEPT)
         return off_ns

@@ -128,7 +128,8 @@ def detect_all(images: Iterable[Pixels], settings: DetectSettings) -> list[Detec
 def _kept(image: Pixels, lit: Groups, number: int) -> Pixels:
     """The pixels around lit groups, at their places in an image whose other pixels are anything.
 
-    Of this thread's memory: valid until the next that is kept as this ``number``.
+    It is of memory that stays with this thread, and valid until the next that is kept as this ``number``. Where nothing
+    is lit there is nothing to keep: then it is ``image`` itself.
     """
     if not lit.counts.size:
         return image

@@ -27,6 +27,7 @@ _HEAD = struct.Struct("<BQ")  # opcode and length of every record
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")  # with opcode and length; summary, summary offsets, CRC of the summary
 _CHUNK_INDEX = struct.Struct("<QQQQ")  # start, end, place and size of the chunk; more follows
+_STATISTICS = struct.Struct("<Q2x12xI")  # messages, chunks; others between and behind
 _CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _DATA_END_SIZE = _HEAD.size + 4
 _LONGEST_HEAD = 4096  # bytes read to learn a record's head; a channel record fits, too
@@ -192,42 +193,72 @@ def _chunks(places: Iterable[Place]) -> set[Range]:
 
 def _chunks_of_summary(descriptor: int, channels: dict[int, str]) -> list[tuple[int, int]] | None:
     """(offset, size) of the chunks by the summary, ``channels`` filled; None if the file has no usable summary."""
+    try:
+        summary = _summary(descriptor)
+        if summary is None:
+            return None
+        found: dict[int, str] = {}
+        chunks: list[tuple[int, int]] = []
+        counts: tuple[int, int] | None = None  # of messages and chunks, by the statistics
+        for opcode, record in summary.records():
+            if opcode == CHANNEL:
+                _add_channel(_HEAD.pack(opcode, len(record)) + record, found)
+            elif opcode == CHUNK_INDEX:
+                _, _, at, size = _CHUNK_INDEX.unpack_from(record)
+                chunks.append((at, size))
+            elif opcode == STATISTICS:
+                counts = _STATISTICS.unpack_from(record)
+    except (OSError, BadChunk, struct.error):
+        return None
+    if any(at + size > summary.at for at, size in chunks) or (counts is None and not chunks):
+        return None
+    if counts is not None and (counts[1] != len(chunks) or (counts[0] and not chunks)):
+        return None
+    channels.update(found)
+    return sorted(chunks)
+
+
+@dataclass(frozen=True)
+class _Summary:
+    at: int
+    """where in the file"""
+    data: memoryview
+
+    def records(self) -> Iterator[tuple[int, bytes]]:
+        """Opcode and content of each. Raises BadChunk where one is cut."""
+        at = 0
+        while at < len(self.data):
+            if at + _HEAD.size > len(self.data):
+                raise BadChunk("a record is cut")
+            opcode, length = _HEAD.unpack_from(self.data, at)
+            at += _HEAD.size
+            if at + length > len(self.data):
+                raise BadChunk("a record runs over its end")
+            yield opcode, bytes(self.data[at : at + length])
+            at += length
+
+
+def _summary(descriptor: int) -> _Summary | None:
+    """A file's summary, verified where it has a CRC; None if there is none.
+
+    Raises BadChunk, struct.error and OSError where the file is cut meanwhile, or the disk fails.
+    """
     end = os.fstat(descriptor).st_size - _FOOTER.size - len(MAGIC)
     if end < 0:
         return None
     footer = os.pread(descriptor, _FOOTER.size + len(MAGIC), end)
-    opcode, length, summary_at, _, crc = _FOOTER.unpack_from(footer)
+    opcode, length, at, _, crc = _FOOTER.unpack_from(footer)
     if not footer.endswith(MAGIC) or (opcode, length) != (FOOTER, _FOOTER.size - _HEAD.size):
         return None
-    if not len(MAGIC) + _DATA_END_SIZE <= summary_at < end:
+    if not len(MAGIC) + _DATA_END_SIZE <= at < end:
         return None
-    if _HEAD.unpack_from(os.pread(descriptor, _HEAD.size, summary_at - _DATA_END_SIZE))[0] != DATA_END:
+    if _HEAD.unpack(os.pread(descriptor, _HEAD.size, at - _DATA_END_SIZE))[0] != DATA_END:
         return None
-    summary = memoryview(bytearray(end - summary_at))
-    try:
-        _read_fully(descriptor, summary, summary_at)
-    except BadChunk:
+    data = memoryview(bytearray(end - at))
+    _read_fully(descriptor, data, at)
+    if crc and crc32(footer[: _FOOTER.size - 4], crc32(data)) != crc:
         return None
-    if crc and crc32(footer[: _FOOTER.size - 4], crc32(summary)) != crc:
-        return None
-    found: dict[int, str] = {}
-    chunks, complete, at = [], False, 0
-    while at + _HEAD.size <= len(summary):
-        opcode, length = _HEAD.unpack_from(summary, at)
-        record = at + _HEAD.size
-        at = record + length
-        if at > len(summary):
-            return None
-        if opcode == CHANNEL:
-            _add_channel(bytes(summary[record - _HEAD.size : at]), found)
-        elif opcode == CHUNK_INDEX and length >= _CHUNK_INDEX.size:
-            _, _, chunk_at, size = _CHUNK_INDEX.unpack_from(summary, record)
-            if chunk_at + size > summary_at:
-                return None
-            chunks.append((chunk_at, size))
-        complete = complete or opcode in (CHUNK_INDEX, STATISTICS)
-    channels.update(found)
-    return sorted(chunks) if complete else None
+    return _Summary(at, data)
 
 
 def _chunks_by_scanning(

@@ -16,6 +16,7 @@ def loaded(places: Sequence[SetPlaces]) -> Iterator[FrameSet]:
     """The frame sets, each valid until the next. What has to come from the disk is on its way ahead of its turn.
 
     What is in the page cache is fetched at its turn, always to the same memory: it never leaves the processor's cache.
+    One at a time in each thread: the next call uses the same memory.
     """
     with _readers() as (at_its_turn, *in_turn), ThreadPoolExecutor(READS_AHEAD, "read-ahead") as ahead:
         on_their_way: deque[tuple[FrameSetReader, Future[None] | None]] = deque()

@@ -17,7 +17,8 @@ PAGE = mmap.PAGESIZE
 HUGE_PAGE = 2 * 1024 * 1024
 GAP_BYTES = 256 * 1024  # less between two ranges is read with them
 MOST_BYTES = 64 * 1024 * 1024  # of one read
-ASKED, CACHED = 5, 4  # pages of a range that are asked about, and that are in the cache where the range is
+ASKED = 5  # pages of a range, to know whether it is in the cache,
+CACHED = 0.8  # and the share of them that are where it is
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _LIBC.mincore.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_char_p
 
@@ -72,6 +73,8 @@ def _memory(size: int) -> mmap.mmap:
     memory = mmap.mmap(-1, -(-size // HUGE_PAGE) * HUGE_PAGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     with contextlib.suppress(OSError):
         memory.madvise(mmap.MADV_HUGEPAGE)
+    with contextlib.suppress(OSError):
+        memory.madvise(mmap.MADV_DONTFORK)  # a fork during a read by O_DIRECT could lose what is read (open(2))
     return memory
 
 
@@ -136,17 +139,22 @@ def _in_cache(path: Path, at: int, size: int) -> bool:
 
 
 def _is_cached(descriptor: int, at: int, size: int) -> bool:
-    """Whether a range is in the page cache, by mincore(2) of a few pages spread over it."""
-    size = min(size, os.fstat(descriptor).st_size - at)
+    """Whether a range is in the page cache, by mincore(2) of a few pages spread over it.
+
+    Of files that are not ours, nor ours to write, it cannot be known: they count as not cached.
+    """
+    status = os.fstat(descriptor)
+    size = min(size, status.st_size - at)
     if size <= 0:
         return True
+    if status.st_uid != os.geteuid() and not os.access(f"/proc/self/fd/{descriptor}", os.W_OK):
+        return False
     with mmap.mmap(descriptor, size, access=mmap.ACCESS_READ, offset=at) as mapped:
         begin = np.frombuffer(mapped, np.uint8).ctypes.data
         resident = ctypes.create_string_buffer(1)
-        missing = 0
-        for place in range(0, size, max(PAGE, size // ASKED // PAGE * PAGE)):
+        places = range(0, size, max(PAGE, -(-size // ASKED) // PAGE * PAGE))
+        there = 0
+        for place in places:
             failed = _LIBC.mincore(begin + place, 1, resident)
-            missing += bool(failed) or not resident.raw[0] & 1
-            if missing > ASKED - CACHED:
-                return False
-    return True
+            there += not failed and resident.raw[0] & 1
+    return there >= CACHED * len(places)

@@ -107,12 +107,15 @@ def crew(workers: int, scheduler: str | None = None, modules: tuple[str, ...] = 
         UsageError: there is no Dask, or none answers at that address.
         ProcessError: the processes do not start.
     """
-    gc.freeze()  # what is loaded stays: looking it through again and again would hold everybody up
+    ours = not gc.get_freeze_count()
+    if ours:
+        gc.freeze()  # what is loaded stays: looking it through again and again would hold everybody up
     try:
         with _crew(workers, scheduler, modules) as hands:
             yield hands
     finally:
-        gc.unfreeze()
+        if ours:
+            gc.unfreeze()
 
 
 @contextmanager

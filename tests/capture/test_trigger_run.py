@@ -227,7 +227,16 @@ def test_two_of_index_counter_and_time_are_believed(tmp_path, rig, index, counte
         run.board.close()
 
 
-def test_a_stall_just_after_a_report_that_came_late_is_no_step_of_the_clock(tmp_path, rig):
+@pytest.mark.parametrize(
+    ("given_ms", "said_ms", "late_ms"),
+    [
+        ((0, 65, 105), (0, 65, 105), (20, 1, 1)),  # a stall just after a report that came late
+        ((0, 40, 80, 120), (0, 40, 160, 200), (1, 2, 1, 1)),  # a clock that steps by two periods, soon after the start,
+        ((0, 40, 80, 120), (0, 40, 580, 1120), (1, 2, 1, 1)),  # and one that steps twice
+    ],
+)
+def test_a_stall_is_told_from_a_step_of_the_clock(tmp_path, rig, given_ms, said_ms, late_ms):
+    """A step is kept aside: the log's times run on evenly; a stall is in them."""
     clock = SetClock()
     aux, triggers = AuxLog(clock), TriggerLog(25)
     ledger = Ledger([("left", "cam0")], 0, clock.utc_ns, aux.loss)
@@ -237,12 +246,12 @@ def test_a_stall_just_after_a_report_that_came_late_is_no_step_of_the_clock(tmp_
         run._clock = clock
         run._epoch = type(run)._start.__globals__["_Epoch"](0, 99)
         begin_ns = clock.now_ns
-        given_ns = [begin_ns, begin_ns + 65_000_000, begin_ns + 105_000_000]
-        for k, late_ns in enumerate([20_000_000, 1_000_000, 1_000_000]):
-            now_ns = clock.now_ns = given_ns[k] + late_ns
-            run._on_pulse(
-                Pulse(k, 100 + k, given_ns[k], given_ns[k]), Trigger(k, 100 + k, given_ns[k], given_ns[k], now_ns)
-            )
-        assert [triggers.nearest(time_ns, 0.0) for time_ns in given_ns] == list(enumerate(given_ns))
+        for k, (given, said, late) in enumerate(zip(given_ms, said_ms, late_ms, strict=True)):
+            now_ns = clock.now_ns = begin_ns + (given + late) * 1_000_000
+            told_ns = begin_ns + said * 1_000_000
+            run._on_pulse(Pulse(k, 100 + k, told_ns, told_ns), Trigger(k, 100 + k, told_ns, told_ns, now_ns))
+        for k, (given, said) in enumerate(zip(given_ms, said_ms, strict=True)):
+            assert triggers.nearest(begin_ns + given * 1_000_000, 0.0) == (k, begin_ns + given * 1_000_000)
+            assert triggers.time_of(k, begin_ns + given * 1_000_000)[0] == begin_ns + said * 1_000_000
     finally:
         run.board.close()
