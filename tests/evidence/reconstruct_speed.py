@@ -1,8 +1,8 @@
 """How fast and how large `reconstruct` is: rendered full-size flights, cold and from the page cache.
 
-``python reconstruct_speed.py FOLDER [--seconds 15,30,60]`` calibrates as for a real rig, renders each flight, evicts it
-from the page cache, reconstructs it, the first one again from the cache, and prints a table with the accuracy: medians
-of REPEATS runs, with the range of the speed.
+``python reconstruct_speed.py FOLDER [--seconds 15,30,60] [--repeats 3]`` calibrates as for a real rig, renders each
+flight, evicts it from the page cache, reconstructs it, the first one again from the cache, and prints a table with the
+accuracy: medians of the runs, with the range of the speed.
 """
 
 import argparse
@@ -18,7 +18,6 @@ from statistics import median
 
 BIN = Path(sys.executable).parent
 SUPPORT = Path(__file__).parents[1] / "support"
-REPEATS = 3
 PIECE_BYTES = 1 << 24
 
 
@@ -27,6 +26,7 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("folder", type=Path)
     options.add_argument("--seconds", default="15,30,60")
+    options.add_argument("--repeats", type=int, default=3)
     given = options.parse_args()
     folder: Path = given.folder / "reconstruct-speed"
     shutil.rmtree(folder, ignore_errors=True)
@@ -41,7 +41,7 @@ def main() -> None:
         sources = {"the disk": evict, "the page cache": warm} if number == 0 else {"the disk": evict}
         for source, prepare in sources.items():
             runs = []
-            for _ in range(REPEATS):
+            for _ in range(given.repeats):
                 prepare(flight)
                 runs.append(reconstructed(folder, seconds))
             report(seconds, source, runs)
