@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -45,6 +46,13 @@ class BoundedProtocol(H11Protocol):  # type: ignore[misc]
             _OPEN[self._client_host] -= 1
             if not _OPEN[self._client_host]:
                 del _OPEN[self._client_host]
+
+    def send_400_response(self, msg: str) -> None:
+        """Say that a request is none, or hang up where its answer is given already."""
+        try:
+            super().send_400_response(msg)
+        except h11.LocalProtocolError:
+            self.transport.abort()
 
     def _hang_up_when_stuck(self) -> None:
         cycle = self.cycle  # of the last request that came whole

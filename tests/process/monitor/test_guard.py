@@ -232,6 +232,19 @@ def test_no_request_brings_it_down(secured, request_bytes):
     assert secured.processes["monitor"].poll() is None
 
 
+def test_rubbish_after_the_answer_is_hung_up_on(secured):
+    """The head of a request is answered before its body has come; the body then is none."""
+    host, port = secured.address.removeprefix("http://").split(":")
+    for _ in range(3):
+        with socket.create_connection((host, int(port)), timeout=5) as connection:
+            connection.sendall(b"GET /metrics HTTP/1.1\r\nhost: localhost\r\ntransfer-encoding: chunked\r\n\r\n")
+            assert b"401" in connection.recv(4096)
+            with contextlib.suppress(ConnectionError):
+                connection.sendall(b"no chunk\r\n\r\n")
+                while connection.recv(4096):
+                    pass
+
+
 def test_after_all_that_it_answers_and_has_complained_of_nothing(secured):
     rng = random.Random(7)
     for _ in range(50):
