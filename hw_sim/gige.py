@@ -89,6 +89,7 @@ class GigeCamera:
         self._ready_at_ns: int | None = None  # None: not acquiring
         self._edges: deque[Pulse] = deque()
         self._deed = ""
+        self._leaving, self._holding = False, threading.Lock()
         self._runs = threading.Event()  # cleared while its firmware hangs
         self._runs.set()
 
@@ -100,6 +101,7 @@ class GigeCamera:
         """
         if self._outer is not None:
             return
+        self._leaving = False
         library = self._library
         serial = f"GIGE{self._number:04d}"
         self._outer = library.new(self.address.encode(), serial.encode(), str(XML).encode())
@@ -122,6 +124,8 @@ class GigeCamera:
 
     def unplug(self) -> None:
         """Be gone, in the middle of whatever it does."""
+        with self._holding:
+            self._leaving = True
         self._runs.set()  # or its thread could not end
         if self._outer is not None:
             self._library.unref(self._outer)  # its thread is joined
@@ -189,7 +193,9 @@ class GigeCamera:
             self._library.write(self._inner, _EDGE, 1)  # the next one of its store
         deed, self._deed = self._deed, ""
         lost = {"drop": 1.0, "truncate": 0.5}.get(deed, 0.0)  # of the packets that follow
-        self._library.set_double(self._outer, b"gvsp-lost-ratio", lost, None)
+        with self._holding:
+            if not self._leaving:  # what the library is letting go of must not be held on to: it would hang
+                self._library.set_double(self._outer, b"gvsp-lost-ratio", lost, None)
         if pulse is None:
             return
         if self._begin_ns is None:
