@@ -1,7 +1,7 @@
 """MCAP files to the places of their messages, and to the messages themselves: one read a chunk, CRC verified.
 
-Only what is needed to read a recording fast: summary and chunks are walked here by hopping from record to record, so
-that indexing never touches a pixel and takes a tenth of the ``mcap`` library's time.
+Only what is needed to read a recording fast and surely: summary and chunks are walked here by hopping from record to
+record, so that indexing never touches a pixel; a summary counts only if its CRC and its number of chunks agree with it.
 Format: https://mcap.dev/spec (records and opcodes), version 0.
 """
 
